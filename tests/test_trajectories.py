@@ -1,0 +1,154 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from oracles_trajectories import dense_difference, dense_error, dense_trajectory
+
+from mmmgpu.errors import InputError
+from mmmgpu.phonemes import PhonemeModels, Utterance, pool
+from mmmgpu.trajectories import (
+    difference_band,
+    error_and_gradient,
+    lay_out_utterances,
+    scaled_smoothness,
+    synthesize_trajectory,
+)
+
+
+def random_models(rng, labels="abcd", n_dims=3):
+    return PhonemeModels(
+        tuple(labels),
+        rng.normal(size=(len(labels), n_dims)),
+        rng.uniform(0.1, 3, size=(len(labels), n_dims)),
+        rng.integers(1, 9, size=len(labels)),
+    )
+
+
+def runs(labels):
+    return np.cumsum([0, *(a != b for a, b in pairwise(labels))])
+
+
+def dense_synthesis(models, labels, segments, smoothness, order):
+    return np.stack(
+        [
+            dense_trajectory(
+                labels,
+                segments,
+                dict(zip(models.labels, models.mean[:, j], strict=True)),
+                dict(zip(models.labels, models.variance[:, j], strict=True)),
+                smoothness[j],
+                order,
+            )
+            for j in range(models.mean.shape[1])
+        ],
+        axis=1,
+    )
+
+
+@pytest.mark.parametrize("order", [1, 2, 4])
+@pytest.mark.parametrize(
+    "labels", ["a", "ab", "aaaa", "aabb", "aabbc", "abbcccddddab", "aaabbbdd" * 5]
+)
+def test_trajectory_solves_equation_3(labels, order):
+    models = random_models(np.random.default_rng(0))
+    smoothness = np.array([0.0, 1.0, 50.0])
+    y = synthesize_trajectory(models, list(labels), smoothness=smoothness, order=order)
+    want = dense_synthesis(models, labels, runs(labels), smoothness, order)
+    np.testing.assert_allclose(y, want, rtol=1e-8, atol=1e-10)
+
+
+def test_neighbouring_segments_of_one_phone_stay_apart():
+    models = random_models(np.random.default_rng(1))
+    labels, segments = "aaaabbcc", [0, 0, 0, 1, 2, 2, 3, 3]
+    y = synthesize_trajectory(models, list(labels), smoothness=2.0, segments=segments)
+    want = dense_synthesis(models, labels, segments, [2.0] * 3, 4)
+    np.testing.assert_allclose(y, want, rtol=1e-9)
+    assert abs(y - synthesize_trajectory(models, list(labels), smoothness=2.0)).max() > 1e-3
+
+
+def test_no_frames_give_no_trajectory():
+    models = random_models(np.random.default_rng(2))
+    assert synthesize_trajectory(models, [], smoothness=1.0).shape == (0, 3)
+
+
+@pytest.mark.parametrize(("n_frames", "order"), [(0, 4), (1, 1), (4, 4), (5, 4), (9, 3), (30, 4)])
+def test_difference_band_is_that_of_the_dense_matrix(n_frames, order):
+    w = dense_difference(n_frames, order)
+    dense = w.T @ w if n_frames > order else np.zeros((n_frames, n_frames))
+    want = [
+        [dense[t + i, t] if t + i < n_frames else 0 for i in range(order + 1)]
+        for t in range(n_frames)
+    ]
+    np.testing.assert_allclose(
+        difference_band(n_frames, order), np.reshape(want, (n_frames, order + 1)), atol=1e-12
+    )
+
+
+def test_scaled_smoothness_makes_trajectories_follow_the_scale():
+    rng = np.random.default_rng(3)
+    models = random_models(rng)
+    scale = np.array([1e-3, 1.0, 1e4])
+    scaled = PhonemeModels(
+        models.labels, models.mean * scale, models.variance * scale**2, models.count
+    )
+    labels = list("aabbbccdda")
+    y = synthesize_trajectory(models, labels, smoothness=scaled_smoothness(models, 3.0))
+    y_scaled = synthesize_trajectory(scaled, labels, smoothness=scaled_smoothness(scaled, 3.0))
+    np.testing.assert_allclose(y_scaled, y * scale, rtol=1e-9)
+
+
+def make_corpus(rng):
+    texts = ["aabbbccd", "ddb", "a", "cccaaabbbddd" * 2]
+    return [Utterance(rng.normal(size=(len(text), 1)), list(text)) for text in texts]
+
+
+def test_gradient_is_the_slope_of_the_dense_error():
+    rng = np.random.default_rng(4)
+    clips = make_corpus(rng)
+    models = pool(clips)
+    mean, variance = models.mean[:, 0], models.variance[:, 0]
+    z = np.concatenate([u.z[:, 0] for u in clips])
+    line = lay_out_utterances(models, clips)
+    error, by_mean, by_log_variance = error_and_gradient(line, z, mean, variance, 1.5)
+
+    def dense(mean, variance):
+        clips_1d = [(u.z[:, 0], u.labels, runs(u.labels)) for u in clips]
+        named = [dict(zip(models.labels, values, strict=True)) for values in (mean, variance)]
+        return dense_error(clips_1d, *named, 1.5, 4)
+
+    np.testing.assert_allclose(error, dense(mean, variance), rtol=1e-10)
+    for p in range(len(mean)):
+        e = 1e-5 * np.eye(len(mean))[p]
+        slope = (dense(mean + e, variance) - dense(mean - e, variance)) / 2e-5
+        np.testing.assert_allclose(by_mean[p], slope, rtol=1e-6, atol=1e-7)
+        up, down = variance * np.exp(e), variance * np.exp(-e)
+        slope = (dense(mean, up) - dense(mean, down)) / 2e-5
+        np.testing.assert_allclose(by_log_variance[p], slope, rtol=1e-6, atol=1e-7)
+
+
+def test_utterances_of_one_timeline_do_not_touch():
+    clips = make_corpus(np.random.default_rng(5))
+    models = pool(clips)
+    args = models.mean[:, 0], models.variance[:, 0], 1.5
+
+    def part(utterances):
+        z = np.concatenate([u.z[:, 0] for u in utterances])
+        return error_and_gradient(lay_out_utterances(models, utterances), z, *args)
+
+    for joint, *parts in zip(part(clips), *(part([u]) for u in clips), strict=True):
+        np.testing.assert_allclose(joint, sum(parts), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"smoothness": -1.0}, "smoothness: must be one number >= 0"),
+        ({"smoothness": [1.0, 2.0]}, "one for each of 3 dimensions"),
+        ({"smoothness": np.nan}, "smoothness: must be"),
+        ({"smoothness": 1.0, "order": 0}, "order: must be at least 1"),
+    ],
+)
+def test_bad_arguments_are_named(options, message):
+    models = random_models(np.random.default_rng(6))
+    with pytest.raises(InputError, match=message):
+        synthesize_trajectory(models, list("aab"), **options)
