@@ -1,0 +1,57 @@
+"""Weighted sums of images, accumulated in float64: 16 values a thread, then what is left over."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+LANES = 16
+vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
+vec16d = wp.types.vector(length=LANES, dtype=wp.float64)
+
+
+@wp.kernel
+def blend(
+    images: wp.array2d[vec16],  # (M, S) as rows of S // 16 whole vectors
+    weights: wp.array[float],  # (batch, M)
+    number: int,  # M
+    size: int,  # S
+    first: int,
+    count: int,
+    # outputs
+    blended: wp.array2d[vec16],  # (batch, S) as rows of S // 16 whole vectors
+):
+    tid = wp.tid()
+    if tid >= count:
+        return
+    vectors = size / LANES
+    b = (first + tid) / vectors
+    v = (first + tid) % vectors
+    total = vec16d()
+    for m in range(number):
+        w = weights[b * number + m]
+        if w != 0.0:
+            total += wp.float64(w) * vec16d(images[m, v])
+    blended[b, v] = vec16(total)
+
+
+@wp.kernel
+def blend_rest(
+    images: wp.array[float],  # (M, S)
+    weights: wp.array[float],  # (batch, M)
+    number: int,  # M
+    size: int,  # S
+    first: int,
+    count: int,
+    # outputs
+    blended: wp.array[float],  # (batch, S), the last S % 16 of each row are written
+):
+    tid = wp.tid()
+    if tid >= count:
+        return
+    rest = size % LANES
+    b = (first + tid) / rest
+    p = size - rest + (first + tid) % rest
+    total = wp.float64(0.0)
+    for m in range(number):
+        total += wp.float64(weights[b * number + m]) * wp.float64(images[m * size + p])
+    blended[b * size + p] = float(total)

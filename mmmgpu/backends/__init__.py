@@ -1,0 +1,90 @@
+"""Compute backends: one module each, imported on first use.
+
+A backend is named ``name`` or ``name:device``: ``"numpy"``, ``"warp"`` (all CPU cores),
+``"warp:cuda:0"``, ``"opencl"``, ``"opencl:0:0"`` (platform and device number). To add one, write a
+module with ``open_backend(device, threads)`` and add its line to `BACKENDS`.
+"""
+
+import functools
+import importlib
+import os
+from typing import Any, Protocol, cast
+
+from mmmgpu.arrays import F32
+from mmmgpu.errors import InputError
+
+BACKENDS = {
+    "numpy": "mmmgpu.backends.reference",
+    "warp": "mmmgpu.backends.nvwarp",
+    "opencl": "mmmgpu.backends.opencl",
+}
+
+
+class Backend(Protocol):
+    """The operations on device arrays: float32, C order, finite, never changed in place.
+
+    Every operation takes and returns device arrays, so that a chain of them stays on the device;
+    `to_device` and `to_host` copy nothing where the device is the CPU and that can be avoided. Two
+    device arrays of one batch may have different lengths on their first axis if one of them is 1.
+    The shapes are those of `mmmgpu.operations` with exactly one batch axis.
+    """
+
+    def to_device(self, array: F32, /) -> Any:
+        """A device array of the same shape. It may share memory with `array`."""
+
+    def to_host(self, array: Any, /) -> F32:
+        """A NumPy array of the same shape. It may share memory with `array`: read only."""
+
+    def forward_warp(self, field: Any, flow: Any, /) -> tuple[Any, Any]:
+        """(B, H, W, C), (B, H, W, 2) -> (B, H, W, C), (B, H, W)."""
+
+    def fill_holes(self, field: Any, weight: Any, threshold: float, /) -> Any:
+        """(B, H, W, C), (B, H, W) -> (B, H, W, C); `field` itself where nothing is to be filled."""
+
+    def blend(self, images: Any, weights: Any, /) -> Any:
+        """(M, H, W, C), (B, M) -> (B, H, W, C)."""
+
+    def sample(self, field: Any, points: Any, /) -> Any:
+        """(B, H, W, C), (B, N, 2) -> (B, N, C)."""
+
+    def distance_scan(self, queries: Any, corpus: Any, weights: Any, /) -> Any:
+        """(K, P, C), (N, P, C), (P,) -> (K, N)."""
+
+
+@functools.cache
+def get_backend(name: str, threads: int | None = None) -> Backend:
+    """The backend called `name`, imported and opened on first use.
+
+    Args:
+        name: ``name`` or ``name:device``.
+        threads: CPU threads; None is `default_threads()`. The results are the same bits for any
+            number. OpenCL decides on its threads when its driver is loaded: there only the
+            environment variable counts.
+
+    Raises:
+        InputError: No such backend or device, or its library is not installed.
+    """
+    family, _, device = name.partition(":")
+    if family not in BACKENDS:
+        raise InputError(f"unknown backend {name!r}; choose one of {sorted(BACKENDS)}")
+    if threads is not None and threads < 1:
+        raise InputError(f"threads must be at least 1, got {threads}")
+    try:
+        module = importlib.import_module(BACKENDS[family])
+    except ModuleNotFoundError as e:
+        raise InputError(
+            f"backend {family!r} needs {e.name!r}, which is not installed; pip install 'mmmgpu'"
+        ) from e
+    return cast(Backend, module.open_backend(device, threads or default_threads()))
+
+
+def default_threads() -> int:
+    """`MMMGPU_THREADS` if it is set, else the number of cores this process may use."""
+    given = os.environ.get("MMMGPU_THREADS", "")
+    if given:
+        if not given.isdecimal() or int(given) < 1:
+            raise InputError(f"MMMGPU_THREADS must be a whole number above 0, got {given!r}")
+        return int(given)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

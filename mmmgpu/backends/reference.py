@@ -1,0 +1,134 @@
+"""NumPy backend: the oracle. Written to be checked against the paper, not to be fast.
+
+It accumulates in float64; what decides where a value goes (the split of a flow into integer and
+fraction, the weights of the taps) is float32, as on every other backend.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.arrays import F32, check_some_valid
+from mmmgpu.errors import InputError
+
+FAR = 1e8  # [px] beyond any picture, inside int32
+
+
+def open_backend(device: str, threads: int | None) -> "Reference":
+    """The reference takes no device, and its answer does not depend on threads."""
+    if device:
+        raise InputError(f"backend 'numpy' has no device {device!r}; ask for 'numpy'")
+    return Reference()
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The operations in plain NumPy; device arrays are NumPy arrays."""
+
+    def to_device(self, array: F32) -> F32:
+        return array
+
+    def to_host(self, array: F32) -> F32:
+        return array
+
+    def forward_warp(self, field: F32, flow: F32) -> tuple[F32, F32]:
+        batch = max(len(field), len(flow))
+        pairs = [_splat(field[b % len(field)], flow[b % len(flow)]) for b in range(batch)]
+        return np.stack([f for f, _ in pairs]), np.stack([w for _, w in pairs])
+
+    def fill_holes(self, field: F32, weight: F32, threshold: float) -> F32:
+        valid = weight >= np.float32(threshold)
+        check_some_valid(valid.sum(axis=(1, 2)))
+        return np.stack([_pull_push(f, v) for f, v in zip(field, valid, strict=True)])
+
+    def blend(self, images: F32, weights: F32) -> F32:
+        return np.tensordot(weights.astype(np.float64), images, axes=1).astype(np.float32)
+
+    def sample(self, field: F32, points: F32) -> F32:
+        batch = max(len(field), len(points))
+        gathered = [_gather(field[b % len(field)], points[b % len(points)]) for b in range(batch)]
+        return np.stack(gathered)
+
+    def distance_scan(self, queries: F32, corpus: F32, weights: F32) -> F32:
+        distance = np.empty((len(queries), len(corpus)), np.float32)
+        for k, query in enumerate(queries.astype(np.float64)):
+            for n, frame in enumerate(corpus):
+                distance[k, n] = np.sqrt(((query - frame) ** 2).sum(axis=-1)) @ weights
+        return distance
+
+
+def _splat(field: F32, flow: F32) -> tuple[F32, F32]:
+    """Forward warp of one field (H, W, C) along one flow (H, W, 2)."""
+    height, width, channels = field.shape
+    whole = np.floor(flow)
+    fraction = flow - whole  # float32
+    x, y = np.moveaxis(np.clip(whole, -FAR, FAR).astype(np.int64), -1, 0)
+    x = x + np.arange(width)
+    y = y + np.arange(height)[:, None]
+    total = np.zeros((height * width, channels + 1))
+    source = np.concatenate([field, np.ones_like(field[..., :1])], axis=-1, dtype=np.float64)
+    for dy, wy in enumerate((1 - fraction[..., 1], fraction[..., 1])):
+        for dx, wx in enumerate((1 - fraction[..., 0], fraction[..., 0])):
+            inside = (x + dx >= 0) & (x + dx < width) & (y + dy >= 0) & (y + dy < height)
+            target = ((y + dy) * width + x + dx)[inside]
+            arriving = (wx * wy)[inside][:, None] * source[inside]
+            for c in range(channels + 1):
+                total[:, c] += np.bincount(target, arriving[:, c], minlength=height * width)
+    weight = total[:, -1:]
+    warped = total[:, :-1] / np.where(weight > 0, weight, 1)
+    return (
+        warped.reshape(field.shape).astype(np.float32),
+        weight.reshape(height, width).astype(np.float32),
+    )
+
+
+def _pull_push(field: F32, valid: NDArray[np.bool_]) -> F32:
+    """Fill the pixels of one field (H, W, C) that are not `valid` (H, W)."""
+    if valid.all():
+        return field.copy()
+    number = valid.astype(np.float64)
+    total = np.where(valid[..., None], field, 0).astype(np.float64)  # sum over the valid pixels
+    filled = _push(total, number).astype(np.float32)
+    filled[valid] = field[valid]
+    return filled
+
+
+def _push(total: NDArray[np.float64], number: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means (h, w, C) of a level's cells, empty ones interpolated from the next coarser level."""
+    mean = total / np.maximum(number, 1)[..., None]
+    if number.all():
+        return mean
+    coarse = _push(_halve(total), _halve(number))
+    return np.where(number[..., None] > 0, mean, _double(coarse, number.shape))
+
+
+def _halve(level: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums over 2 x 2 blocks, the last row and column padded with zeros: (h, w, ...) -> half."""
+    odd = [(0, n % 2) for n in level.shape[:2]] + [(0, 0)] * (level.ndim - 2)
+    a = np.pad(level, odd)
+    return a[::2, ::2] + a[::2, 1::2] + a[1::2, ::2] + a[1::2, 1::2]
+
+
+def _double(level: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Bilinear upsampling by two to `shape` (h, w), the border clamped."""
+    for axis, size in enumerate(shape):
+        i = np.arange(size)
+        near = i // 2
+        far = np.clip(near + 2 * (i % 2) - 1, 0, level.shape[axis] - 1)
+        level = 0.75 * level.take(near, axis) + 0.25 * level.take(far, axis)
+    return level
+
+
+def _gather(field: F32, points: F32) -> F32:
+    """Bilinear samples (..., C) of one field (H, W, C) at points (..., 2)."""
+    height, width, _ = field.shape
+    limit = np.array([width - 1, height - 1], np.float32)
+    p = np.clip(points, 0, limit)
+    x0, y0 = np.moveaxis(p.astype(np.int64), -1, 0)
+    x1 = np.minimum(x0 + 1, width - 1)
+    y1 = np.minimum(y0 + 1, height - 1)
+    fx, fy = np.moveaxis((p - np.floor(p)).astype(np.float64)[..., None], -2, 0)
+    top = (1 - fx) * field[y0, x0] + fx * field[y0, x1]
+    bottom = (1 - fx) * field[y1, x0] + fx * field[y1, x1]
+    return ((1 - fy) * top + fy * bottom).astype(np.float32)

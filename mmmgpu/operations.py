@@ -1,0 +1,164 @@
+"""The image operations: NumPy arrays in, NumPy arrays out, inputs unchanged.
+
+Images, flows and other fields are float32, C order, (..., H, W, C); the leading axes are a batch of
+any shape, none and empty included, and broadcast against those of the other arguments. A flow is
+(..., H, W, 2) = (dx, dy) [px]. NaN and infinite values are an `InputError` that names the argument.
+
+Chains of operations that are to stay on a device use `mmmgpu.backends.get_backend` instead.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mmmgpu.arrays import F32, as_batch, as_float32, broadcast_leads
+from mmmgpu.backends import Backend, get_backend
+from mmmgpu.errors import InputError
+
+FIELD = ("...", "H", "W", "C")
+
+
+def forward_warp(field: ArrayLike, flow: ArrayLike, *, backend: str = "warp") -> tuple[F32, F32]:
+    """Carry every pixel of `field` along `flow` and splat it on its four neighbours: W_F(p, q).
+
+        t = s + q(s),   weight(t) = sum_s w,   warped(t) = sum_s w p(s) / weight(t)
+
+    with w the bilinear weight of source s at pixel t. What falls outside is dropped.
+
+    Args:
+        field: Values of any unit, shape (..., H, W, C): an image, or another flow.
+        flow: (dx, dy) [px], shape (..., H, W, 2), from a pixel of `field` to where it goes.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The warped field, shape (..., H, W, C), 0 where nothing arrived, and the weight that
+        arrived [1], shape (..., H, W).
+    """
+    f = as_float32("field", field, *FIELD)
+    height, width, channels = f.shape[-3:]
+    q = as_float32("flow", flow, "...", height, width, 2)
+    lead = broadcast_leads(field=f.shape[:-3], flow=q.shape[:-3])
+    shape = (*lead, height, width)
+    if not math.prod(shape) * channels:
+        return np.zeros((*shape, channels), np.float32), np.zeros(shape, np.float32)
+    k = get_backend(backend)
+    warped, weight = k.forward_warp(*_on_device(k, as_batch(f, lead, 3), as_batch(q, lead, 3)))
+    return k.to_host(warped).reshape(*shape, channels), k.to_host(weight).reshape(shape)
+
+
+def fill_holes(
+    field: ArrayLike, weight: ArrayLike, *, threshold: float = 0.01, backend: str = "warp"
+) -> F32:
+    """Fill the pixels whose weight is below `threshold` from those around them (pull-push).
+
+    Valid pixels are averaged down a pyramid to one cell, and holes interpolated back up from the
+    finest level that has a value near them (Gortler et al., The Lumigraph, 1996). Valid pixels keep
+    their bits.
+
+    Args:
+        field: Values of any unit, shape (..., H, W, C).
+        weight: Confidence, shape (..., H, W), as `forward_warp` returns it.
+        threshold: Weight below which a pixel is a hole, in the unit of `weight`.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The filled field, shape (..., H, W, C).
+
+    Raises:
+        InputError: A field without any valid pixel.
+    """
+    f = as_float32("field", field, *FIELD)
+    w = as_float32("weight", weight, "...", *f.shape[-3:-1])
+    if not math.isfinite(threshold):
+        raise InputError(f"threshold must be a finite number, got {threshold}")
+    lead = broadcast_leads(field=f.shape[:-3], weight=w.shape[:-2])
+    shape = (*lead, *f.shape[-3:])
+    if not math.prod(shape):
+        return np.zeros(shape, np.float32)
+    f = np.broadcast_to(f, shape).reshape(-1, *f.shape[-3:])
+    w = np.broadcast_to(w, shape[:-1]).reshape(-1, *w.shape[-2:])
+    k = get_backend(backend)
+    values, confidence = _on_device(k, f, w)
+    filled = k.to_host(k.fill_holes(values, confidence, threshold)).reshape(shape)
+    return filled.copy() if np.may_share_memory(filled, f) else filled
+
+
+def blend(images: ArrayLike, weights: ArrayLike, *, backend: str = "warp") -> F32:
+    """Weighted sums of images: blended[b] = sum_m weights[b, m] images[m].
+
+    Args:
+        images: Values of any unit, shape (M, H, W, C).
+        weights: Weights [1], shape (..., M); they need not sum to 1.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The blends, shape (..., H, W, C).
+    """
+    i = as_float32("images", images, "M", "H", "W", "C")
+    w = as_float32("weights", weights, "...", len(i))
+    shape = (*w.shape[:-1], *i.shape[1:])
+    if not math.prod(shape) * len(i):
+        return np.zeros(shape, np.float32)
+    k = get_backend(backend)
+    return k.to_host(k.blend(*_on_device(k, i, w.reshape(-1, len(i))))).reshape(shape)
+
+
+def sample(field: ArrayLike, points: ArrayLike, *, backend: str = "warp") -> F32:
+    """Bilinear samples of `field` at `points`, the border clamped.
+
+    Args:
+        field: Values of any unit, shape (batch..., H, W, C).
+        points: (x, y) [px], pixel centres at whole numbers, shape (batch..., any..., 2): its first
+            axes are the batch axes of `field` (1 broadcasts), the others are free.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The samples, shape (batch..., any..., C).
+    """
+    f = as_float32("field", field, *FIELD)
+    p = as_float32("points", points, "...", 2)
+    own = f.shape[:-3]
+    if p.ndim <= len(own):
+        raise InputError(f"points must have shape (*{own}, ..., 2) as field has, got {p.shape}")
+    lead = broadcast_leads(field=own, points=p.shape[: len(own)])
+    free = p.shape[len(own) : -1]
+    shape = (*lead, *free, f.shape[-1])
+    if not math.prod(shape):
+        return np.zeros(shape, np.float32)
+    p = p.reshape(*p.shape[: len(own)], math.prod(free), 2)
+    k = get_backend(backend)
+    sampled = k.sample(*_on_device(k, as_batch(f, lead, 3), as_batch(p, lead, 2)))
+    return k.to_host(sampled).reshape(shape)
+
+
+def distance_scan(
+    queries: ArrayLike, corpus: ArrayLike, weights: ArrayLike, *, backend: str = "warp"
+) -> F32:
+    """Weighted distances of every query to every corpus field (CE05, Eq. 7 and 10).
+
+        D[k, n] = sum_p weights[p] |queries[k, p] - corpus[n, p]|
+
+    with the Euclidean norm over the channels.
+
+    Args:
+        queries: Flattened fields of any unit, shape (K, P, C).
+        corpus: Fields of the same unit, shape (N, P, C).
+        weights: Weight of each point [1], shape (P,).
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        Distances in the unit of the fields, shape (K, N).
+    """
+    q = as_float32("queries", queries, "K", "P", "C")
+    c = as_float32("corpus", corpus, "N", *q.shape[1:])
+    w = as_float32("weights", weights, q.shape[1])
+    if not q.size * c.size:
+        return np.zeros((len(q), len(c)), np.float32)
+    k = get_backend(backend)
+    return k.to_host(k.distance_scan(*_on_device(k, q, c, w)))
+
+
+def _on_device(backend: Backend, *arrays: F32) -> list[Any]:
+    return [backend.to_device(a) for a in arrays]
