@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -59,7 +60,7 @@ class _Scan:
     matrix: tuple[int, int, int, int]  # (a, b, c, d) of the display matrix
     fps: Fraction
     repeats: NDArray[np.int64]  # (source frames,): how often each one is shown
-    last_key: int | None  # timestamp of the last key frame
+    last_key: int | None  # decoding timestamp of the last key frame
     has_sound: bool
 
 
@@ -102,7 +103,7 @@ def probe(path: str | os.PathLike[str], *, minimum_frames: int = 1) -> VideoInfo
     `minimum_frames` frames.
     """
     scan = _scan(path)
-    _check_end(path, scan)
+    _check_end(path, scan.last_key)
     width, height = scan.first.width, scan.first.height
     if _is_transposed(scan.matrix):
         width, height = height, width
@@ -176,7 +177,7 @@ def _scan(path: str | os.PathLike[str]) -> _Scan:
                 first = next((f for f in packet.decode() if isinstance(f, VideoFrame)), None)
             if packet.size and not packet.is_discard:
                 stamps.append(packet.pts)
-                last_key = packet.pts if packet.is_keyframe else last_key
+                last_key = packet.dts if packet.is_keyframe else last_key
         if first is None or first.width * first.height == 0:
             raise InputError(f"{path}: no frame can be decoded; {_COMPLETE}")
         _check_promises(path, media, stream, len(stamps), max(ends))
@@ -199,15 +200,17 @@ def _check_promises(
         raise InputError(f"{path}: truncated: ends at {end:.2f} s of {promised:.2f} s; {_COMPLETE}")
 
 
-def _check_end(path: str | os.PathLike[str], scan: _Scan) -> None:
+def _check_end(path: str | os.PathLike[str], last_key: int | None) -> None:
     """Decode the last frames: a file cut in the middle of a frame has a damaged last one."""
-    damaged = False
+    damaged: bool | None = None
     with open_media(path) as media:
         stream = video_stream(media, path)
-        if scan.last_key is not None:
-            media.seek(scan.last_key, stream=stream)
+        if last_key is not None:
+            media.seek(last_key, stream=stream)
         for frame in media.decode(stream):
             damaged = frame.is_corrupt
+    if damaged is None and last_key is not None:  # sought too far: decode all
+        _check_end(path, None)
     if damaged:
         raise InputError(f"{path}: truncated: the last frame is incomplete; {_COMPLETE}")
 
@@ -274,9 +277,11 @@ def _nearest_in_time(times: NDArray[np.float64], rate: Fraction) -> NDArray[np.i
 
 def _display_matrix(frame: VideoFrame) -> tuple[int, int, int, int]:
     """Return (a, b, c, d): pixel (x, y) is shown at (a x + c y, b x + d y), up to a shift."""
-    if SideDataType.DISPLAYMATRIX not in frame.side_data:
+    side_data: Any = frame.side_data  # av's own types name its class wrongly
+    matrix = side_data.get(SideDataType.DISPLAYMATRIX)
+    if matrix is None:
         return 1, 0, 0, 1
-    m = np.frombuffer(bytes(frame.side_data[SideDataType.DISPLAYMATRIX]), np.int32)
+    m = np.frombuffer(bytes(matrix), np.int32)
     return int(m[0]), int(m[1]), int(m[3]), int(m[4])
 
 
