@@ -91,7 +91,9 @@ class PhonemeModels:
         return np.average(self.variance, axis=0, weights=self.count)
 
 
-def pool(utterances: Sequence[Utterance], *, floor_share: float = 0.05) -> PhonemeModels:
+def pool(
+    utterances: Sequence[Utterance], *, floor_share: float = 0.05, labels: Sequence[str] = ()
+) -> PhonemeModels:
     """Estimate each phone's Gaussian from all of its frames.
 
         mu_p = mean of z_t over t in p,    sigma2_p = max(var of z_t over t in p, floor)
@@ -103,29 +105,32 @@ def pool(utterances: Sequence[Utterance], *, floor_share: float = 0.05) -> Phone
     Args:
         utterances: The training clips.
         floor_share: Least share of the stream's variance that a phone may have, in (0, 1].
+        labels: Phones that get a model even if no frame has them: mean and variance of the stream,
+            so that their frames are led by their neighbours.
 
     Raises:
         InputError: There is no frame, or the dimensions of the clips differ.
     """
-    z, phone, labels = _stack(utterances)
-    count = np.bincount(phone, minlength=len(labels))
-    mean = _sum_by(phone, z, len(labels)) / count[:, None]
-    variance = _sum_by(phone, (z - mean[phone]) ** 2, len(labels)) / count[:, None]
-    floor = floor_share * _positive(z.var(axis=0))
-    return PhonemeModels(labels, mean, np.maximum(variance, floor), count)
+    z, spoken = _stack(utterances)
+    names, row = np.unique([*spoken, *labels], return_inverse=True)
+    phone = row[: len(spoken)]
+    count = np.bincount(phone, minlength=len(names))
+    frames = np.maximum(count, 1)[:, None]
+    mean = np.where(count[:, None], _sum_by(phone, z, len(names)) / frames, z.mean(axis=0))
+    spread = _sum_by(phone, (z - mean[phone]) ** 2, len(names)) / frames
+    whole = _positive(z.var(axis=0))
+    variance = np.where(count[:, None], np.maximum(spread, floor_share * whole), whole)
+    return PhonemeModels(tuple(names.tolist()), mean, variance, count)
 
 
-def _stack(
-    utterances: Sequence[Utterance],
-) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
-    """All frames (N, d), their phones (N,) as numbers, and the sorted labels of the numbers."""
+def _stack(utterances: Sequence[Utterance]) -> tuple[NDArray[np.float64], list[str]]:
+    """All frames, shape (N, d), and their phones, length N."""
     if sum(len(u.z) for u in utterances) == 0:
         raise InputError("utterances: no frame to learn from; give at least one labelled clip")
     if len({u.z.shape[1] for u in utterances}) > 1:
         raise InputError("utterances: clips differ in dimension; analyse all with one model")
-    labels, phone = np.unique([p for u in utterances for p in u.labels], return_inverse=True)
     z = np.concatenate([np.asarray(u.z, dtype=np.float64) for u in utterances])
-    return z, phone.astype(np.int64), tuple(labels.tolist())
+    return z, [label for u in utterances for label in u.labels]
 
 
 def _sum_by(group: NDArray[np.int64], x: NDArray[np.float64], n: int) -> NDArray[np.float64]:
@@ -141,10 +146,8 @@ def _positive(variance: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(variance, least) if least > 0 else np.ones_like(variance)
 
 
-def segment_durations(
-    labels: Sequence[str], segments: ArrayLike | None = None
-) -> NDArray[np.int64]:
-    """Length in frames of the segment that each frame is in, shape (T,).
+def segment_starts(labels: Sequence[str], segments: ArrayLike | None = None) -> NDArray[np.int64]:
+    """First frame of every segment, in order, shape (S,).
 
     Args:
         labels: Phones, length T.
@@ -153,13 +156,20 @@ def segment_durations(
     Raises:
         InputError: `segments` and `labels` differ in length.
     """
-    if len(labels) == 0:
-        return np.zeros(0, dtype=np.int64)
     mark = np.asarray(labels if segments is None else segments)
     if len(mark) != len(labels):
         raise InputError(
             f"segments: must have one number a frame, got {len(mark)} for {len(labels)} labels"
         )
-    starts = np.flatnonzero(np.r_[True, mark[1:] != mark[:-1]])
-    lengths = np.diff(np.r_[starts, len(mark)])
+    return np.flatnonzero(np.r_[len(mark) > 0, mark[1:] != mark[:-1]])
+
+
+def segment_durations(
+    labels: Sequence[str], segments: ArrayLike | None = None
+) -> NDArray[np.int64]:
+    """Length in frames of the segment that each frame is in, shape (T,).
+
+    Arguments and errors are those of `segment_starts`.
+    """
+    lengths = np.diff(np.r_[segment_starts(labels, segments), len(labels)])
     return np.repeat(lengths, lengths)
