@@ -122,9 +122,11 @@ def synthesize_trajectory(
     """
     lam = _checked_smoothness(smoothness, order, models.mean.shape[1])
     phone = models.index(labels, stand_in=stand_in)
+    if len(phone) == 0:
+        return np.empty((0, len(lam)))
     line = lay_out([phone], [segment_durations(labels, segments)], order=order)
     y = [follow(line, models.mean[:, j], models.variance[:, j], lam[j])[0] for j in range(len(lam))]
-    return np.stack(y, axis=1).reshape(len(phone), len(lam))
+    return np.stack(y, axis=1)
 
 
 def _checked_smoothness(smoothness: ArrayLike, order: int, n_dims: int) -> Array:
@@ -160,8 +162,6 @@ def follow(line: Timeline, mean: Array, variance: Array, smoothness: float) -> t
 
 def _solve(factor: Array, b: Array) -> Array:
     """A^-1 b."""
-    if len(b) == 0:
-        return b
     x: Array = cho_solve_banded((factor, True), b, check_finite=False)
     return x
 

@@ -83,3 +83,16 @@ def test_bad_input_is_named():
         Utterance(np.full((1, 2), np.nan), ["a"])
     with pytest.raises(InputError, match="got 2 for 3 labels"):
         segment_durations(list("aab"), [0, 1])
+
+
+def test_a_phone_without_frames_gets_the_streams_gaussian_if_asked_for():
+    rng = np.random.default_rng(5)
+    clip = utterance(rng, "aacc")
+    models = pool([clip], labels=["b", "a"])
+    assert models.labels == ("a", "b", "c")
+    np.testing.assert_array_equal(models.count, [2, 0, 2])
+    np.testing.assert_allclose(models.mean[1], clip.z.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(models.variance[1], clip.z.var(axis=0), rtol=1e-12)
+    without = pool([clip])
+    np.testing.assert_array_equal(models.mean[[0, 2]], without.mean)
+    np.testing.assert_array_equal(models.variance[[0, 2]], without.variance)
