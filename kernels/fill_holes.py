@@ -1,7 +1,8 @@
 """Pull-push hole filling: valid pixels are averaged down a pyramid, holes interpolated back up.
 
-A pixel is valid where its weight reaches the threshold. A coarse cell holds the mean of the valid
-pixels of its block and their number; a cell without any is interpolated from the level above it.
+A cell is valid where its weight reaches the threshold. A coarse cell holds the mean of the valid
+pixels of its block, and their number as its weight; one without any is interpolated from the level
+above it. Every thread takes one row.
 """
 
 import warp as wp
@@ -30,15 +31,23 @@ def count_valid(
     valid[row] = n
 
 
+@wp.func
+def share(weight: float, threshold: float, finest: int):
+    """Number of valid pixels in a cell; in the finest level weights are not numbers yet."""
+    if weight < threshold:
+        return 0.0
+    return wp.where(finest == 1, 1.0, weight)
+
+
 @wp.kernel
 def pull(
-    holes: wp.array[int],  # (batch,) 1 where the image has holes; the others are skipped
+    holes: wp.array[int],  # (batch,) 0 where an image has no holes: it is skipped
     value: wp.array[float],  # (batch, h, w, C), a level
-    weight: wp.array[float],  # (batch, h, w), at the finest level of the caller, then the numbers
+    weight: wp.array[float],  # (batch, h, w)
     threshold: float,
     finest: int,
-    height: int,
-    width: int,
+    height: int,  # h
+    width: int,  # w
     channels: int,
     first: int,
     count: int,
@@ -49,67 +58,75 @@ def pull(
     tid = wp.tid()
     if tid >= count:
         return
-    cell = first + tid
-    columns = (width + 1) / 2
     rows = (height + 1) / 2
-    b = cell / (rows * columns)
+    columns = (width + 1) / 2
+    b = (first + tid) / rows
     if holes[b] == 0:
         return
-    y = 2 * ((cell / columns) % rows)
-    x = 2 * (cell % columns)
-    n = float(0.0)
-    for c in range(channels):
-        coarse[cell * channels + c] = 0.0
-    for ty in range(y, wp.min(y + 2, height)):
-        for tx in range(x, wp.min(x + 2, width)):
-            i = (b * height + ty) * width + tx
-            if weight[i] >= threshold:
-                w = wp.where(finest == 1, 1.0, weight[i])
-                n += w
-                for c in range(channels):
-                    coarse[cell * channels + c] += w * value[i * channels + c]
-    if n > 0.0:
+    y = 2 * ((first + tid) % rows)
+    upper = (b * height + y) * width
+    lower = (b * height + wp.min(y + 1, height - 1)) * width
+    for column in range(columns):
+        x = 2 * column
+        right = wp.min(x + 1, width - 1)
+        n00 = share(weight[upper + x], threshold, finest)
+        n01 = share(weight[upper + right], threshold, finest)
+        n10 = share(weight[lower + x], threshold, finest)
+        n11 = share(weight[lower + right], threshold, finest)
+        if x + 1 >= width:
+            n01 = 0.0
+            n11 = 0.0
+        if y + 1 >= height:
+            n10 = 0.0
+            n11 = 0.0
+        n = n00 + n01 + n10 + n11
+        scale = wp.where(n > 0.0, 1.0 / n, 0.0)
+        cell = (first + tid) * columns + column
+        number[cell] = n
         for c in range(channels):
-            coarse[cell * channels + c] = coarse[cell * channels + c] / n
-    number[cell] = n
+            total = n00 * value[(upper + x) * channels + c]
+            total += n01 * value[(upper + right) * channels + c]
+            total += n10 * value[(lower + x) * channels + c]
+            total += n11 * value[(lower + right) * channels + c]
+            coarse[cell * channels + c] = total * scale
 
 
 @wp.kernel
 def push(
-    holes: wp.array[int],  # (batch,) 1 where the image has holes; the others are copied
-    value: wp.array[float],  # (batch, h, w, C), a level
+    holes: wp.array[int],  # (batch,) 0 where an image has no holes: it is skipped
     weight: wp.array[float],  # (batch, h, w)
     coarse: wp.array[float],  # (batch, ceil(h / 2), ceil(w / 2), C), complete
     threshold: float,
-    height: int,
-    width: int,
+    height: int,  # h
+    width: int,  # w
     channels: int,
     first: int,
     count: int,
     # outputs
-    filled: wp.array[float],  # (batch, h, w, C), may be `value`
+    value: wp.array[float],  # (batch, h, w, C), its holes are written
 ):
     tid = wp.tid()
     if tid >= count:
         return
-    i = first + tid
-    b = i / (height * width)
-    if holes[b] == 0 or weight[i] >= threshold:
-        for c in range(channels):
-            filled[i * channels + c] = value[i * channels + c]
-        return
-    columns = (width + 1) / 2
     rows = (height + 1) / 2
-    x = i % width
-    y = (i / width) % height
-    # the near cell holds the pixel (3/4), the far one is its neighbour on the pixel's side (1/4)
-    x0 = x / 2
-    y0 = y / 2
-    x1 = wp.clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1)
-    y1 = wp.clamp(y0 + 2 * (y % 2) - 1, 0, rows - 1)
-    near = (b * rows + y0) * columns
+    columns = (width + 1) / 2
+    row = first + tid
+    b = row / height
+    if holes[b] == 0:
+        return
+    y = row % height
+    # a pixel lies 1/4 from the centre of its own cell towards the next cell on its side
+    y1 = wp.clamp(y / 2 + 2 * (y % 2) - 1, 0, rows - 1)
+    near = (b * rows + y / 2) * columns
     far = (b * rows + y1) * columns
-    for c in range(channels):
-        a0 = 0.75 * coarse[(near + x0) * channels + c] + 0.25 * coarse[(near + x1) * channels + c]
-        a1 = 0.75 * coarse[(far + x0) * channels + c] + 0.25 * coarse[(far + x1) * channels + c]
-        filled[i * channels + c] = 0.75 * a0 + 0.25 * a1
+    for x in range(width):
+        i = row * width + x
+        if weight[i] < threshold:
+            x0 = x / 2
+            x1 = wp.clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1)
+            for c in range(channels):
+                a0 = 0.75 * coarse[(near + x0) * channels + c]
+                a0 += 0.25 * coarse[(near + x1) * channels + c]
+                a1 = 0.75 * coarse[(far + x0) * channels + c]
+                a1 += 0.25 * coarse[(far + x1) * channels + c]
+                value[i * channels + c] = 0.75 * a0 + 0.25 * a1

@@ -46,11 +46,6 @@ class Level:
     weight: Any  # (B, h, w)
     threshold: float
 
-    @property
-    def cells(self) -> int:
-        """Cells of one image."""
-        return int(self.value.shape[1] * self.value.shape[2])
-
 
 @dataclass(frozen=True)
 class Warp:
@@ -73,12 +68,14 @@ class Warp:
         batch = max(fields, flows)
         bands = min(height, math.ceil(self.workers / batch))
         rows = math.ceil(height / bands)
-        total = self._empty(self.workers, rows, width, channels + 1, dtype=wp.float64)
+        total = self._empty(self.workers, rows, width, dtype=forward_warp.vec4d)
+        mass = self._empty(self.workers, rows, width, dtype=wp.float64)
         warped = self._empty(batch, height, width, channels)
         weight = self._empty(batch, height, width)
-        sizes = [fields, flows, batch, height, width, channels, bands, self.workers]
-        outputs = [total, warped, weight]
-        self._launch(forward_warp.forward_warp, self.workers, [field, flow, *sizes], outputs)
+        for channel in range(0, channels, forward_warp.GROUP):
+            sizes = [fields, flows, batch, height, width, channels, channel, bands, self.workers]
+            inputs, outputs = [field, flow, *sizes], [total, mass, warped, weight]
+            self._launch(forward_warp.forward_warp, self.workers, inputs, outputs)
         return warped, weight
 
     def fill_holes(self, field: Any, weight: Any, threshold: float) -> Any:
@@ -90,12 +87,11 @@ class Warp:
         if (number == height * width).all():
             return field
         holes: Any = wp.array(number < height * width, dtype=int, device=self.device)
-        filled = self._empty(*field.shape)
-        levels = [Level(field, weight, threshold)]
-        while levels[-1].cells > 1:
+        levels = [Level(self._empty(*field.shape), weight, threshold)]
+        while levels[-1].value.shape[1:3] != (1, 1):
             levels.append(self._coarser(levels[-1]))
-        self._chunks(batch, functools.partial(self._pull_push, holes, levels, filled))
-        return filled
+        self._chunks(batch, functools.partial(self._pull_push, field, holes, levels))
+        return levels[0].value
 
     def blend(self, images: Any, weights: Any) -> Any:
         number, *shape = images.shape
@@ -144,21 +140,22 @@ class Warp:
         return Level(self._empty(*half, channels), self._empty(*half), threshold=0.5)
 
     def _pull_push(
-        self, holes: Any, levels: list[Level], filled: Any, first: int, count: int
+        self, field: Any, holes: Any, levels: list[Level], first: int, count: int
     ) -> None:
         """Fill the images `first` ... `first + count - 1`: down the levels, and up again."""
+        start, size = first * field.strides[0] // 4, count * field.strides[0] // 4
+        wp.copy(levels[0].value, field, start, start, size)
         pairs = list(itertools.pairwise(levels))
         for fine, coarse in pairs:
+            rows = coarse.value.shape[1]
             inputs = [holes, fine.value, fine.weight, fine.threshold, int(fine is levels[0])]
             inputs += fine.value.shape[1:]
-            span = first * coarse.cells, count * coarse.cells
-            self._launch_chunk(fill_holes.pull, *span, inputs, [coarse.value, coarse.weight])
+            outputs = [coarse.value, coarse.weight]
+            self._launch_chunk(fill_holes.pull, first * rows, count * rows, inputs, outputs)
         for fine, coarse in reversed(pairs):
-            inputs = [holes, fine.value, fine.weight, coarse.value, fine.threshold]
-            inputs += fine.value.shape[1:]
-            span = first * fine.cells, count * fine.cells
-            target = filled if fine is levels[0] else fine.value
-            self._launch_chunk(fill_holes.push, *span, inputs, [target])
+            rows = fine.value.shape[1]
+            inputs = [holes, fine.weight, coarse.value, fine.threshold, *fine.value.shape[1:]]
+            self._launch_chunk(fill_holes.push, first * rows, count * rows, inputs, [fine.value])
 
     def _packed(self, fields: Any, first: int, count: int) -> Any:
         """Rows of `fields` (N, P, C) as padded planes of vectors, shape (count * C * V,)."""

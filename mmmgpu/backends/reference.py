@@ -131,4 +131,5 @@ def _gather(field: F32, points: F32) -> F32:
     fx, fy = np.moveaxis((p - np.floor(p)).astype(np.float64)[..., None], -2, 0)
     top = (1 - fx) * field[y0, x0] + fx * field[y0, x1]
     bottom = (1 - fx) * field[y1, x0] + fx * field[y1, x1]
-    return ((1 - fy) * top + fy * bottom).astype(np.float32)
+    sampled: F32 = ((1 - fy) * top + fy * bottom).astype(np.float32)
+    return sampled
