@@ -11,12 +11,17 @@ Source: Chang & Ezzat, "Transferable Videorealistic Speech Animation" (SCA 2005)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mmmgpu.errors import InputError
+
+StandIn = Callable[
+    [str, AbstractSet[str]], str
+]  # (phone, phones with a model) -> one of the latter
 
 TINY_SHARE = 1e-6  # of the mean variance of all dimensions: what a dimension that never moves gets
 
@@ -62,22 +67,21 @@ class PhonemeModels:
     variance: NDArray[np.float64]
     count: NDArray[np.int64]
 
-    def index(
-        self, labels: Sequence[str], *, stand_in: Callable[[str], str] | None = None
-    ) -> NDArray[np.int64]:
+    def index(self, labels: Sequence[str], *, stand_in: StandIn | None = None) -> NDArray[np.int64]:
         """Row of each label, shape (T,).
 
         Args:
             labels: Phones, length T.
-            stand_in: Gives, for a phone that has no model, one that has.
+            stand_in: Gives, for a phone that has no model, one that has; `mmmgpu.phones.stand_in`.
 
         Raises:
             InputError: A phone has no model, nor has its stand-in.
         """
         row = {label: p for p, label in enumerate(self.labels)}
+        modelled = frozenset(self.labels)
         for label in sorted(set(labels) - row.keys()):
-            known = stand_in(label) if stand_in else label
-            if known not in row:
+            known = stand_in(label, modelled) if stand_in else label
+            if known not in modelled:
                 raise InputError(
                     f"labels: phone {label!r} has no model; "
                     f"train with speech that has it, or use one of {', '.join(self.labels)}"

@@ -22,7 +22,7 @@ Sources: CE05 = Chang & Ezzat, "Transferable Videorealistic Speech Animation" (S
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb
 
@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from mmmgpu.errors import InputError
-from mmmgpu.phonemes import PhonemeModels, Utterance, segment_durations
+from mmmgpu.phonemes import PhonemeModels, StandIn, Utterance, segment_durations
 
 LEAST_WEIGHT = 0.02  # of D^2: an utterance of a single phone would have D = 0 and no solution
 
@@ -102,7 +102,7 @@ def synthesize_trajectory(
     smoothness: ArrayLike,
     order: int = 4,
     segments: ArrayLike | None = None,
-    stand_in: Callable[[str], str] | None = None,
+    stand_in: StandIn | None = None,
 ) -> Array:
     """Solve Eq. 3 for a row of phones: A y = D' Sigma^-1 D mu.
 
@@ -112,7 +112,7 @@ def synthesize_trajectory(
         smoothness: lambda [1/model coordinates squared], one number or shape (d,), not negative.
         order: k, the order of the difference that is kept small; at least 1.
         segments: Segment number of each frame, shape (T,). None: runs of equal labels.
-        stand_in: Gives a phone that has a model for one that has none.
+        stand_in: Gives, for a phone that has no model, one that has; `mmmgpu.phones.stand_in`.
 
     Returns:
         y [model coordinates], shape (T, d).

@@ -43,6 +43,9 @@ Progress = Callable[[int, int], None]  # called with (steps done, steps in all)
 
 OFFSET_PRIOR = 10  # frames: an offset of a clip this long is trusted by half
 SHARE_OF_LOG_VARIANCE = 0.1  # of the ridge: what pulls log sigma2 to the pooled one
+MOST_LOG_VARIANCE = np.log(
+    100
+)  # sigma2 stays within this factor of the pooled one: A stays regular
 
 
 @dataclass(frozen=True)
@@ -227,8 +230,17 @@ def _descend(
         values.append(intermediate_result.fun)
 
     limits = {"maxiter": iterations, "maxfun": 4 * iterations, "maxcor": 20, "ftol": 1e-9}
+    bounds = [(None, None)] * n + [(-MOST_LOG_VARIANCE, MOST_LOG_VARIANCE)] * n
     if iterations:
-        minimize(objective, start, jac=True, method="L-BFGS-B", callback=keep, options=limits)
+        minimize(
+            objective,
+            start,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            callback=keep,
+            options=limits,
+        )
     x = np.stack(xs + xs[-1:] * (iterations + 1 - len(xs)))
     value = np.array(values + values[-1:] * (iterations + 1 - len(values)))
     return _Path(*gaussians(x), (value - x**2 @ weight) * v / len(z))
