@@ -112,8 +112,8 @@ def fit_stream(
         utterances: The training clips, and no others.
         rng: Deals the clips into folds.
         folds: At most so many; no more than clips, and a single clip is cut.
-        progress: Called with (steps done, steps in all), first while the constants are chosen and then,
-            from 1 again, for each dimension trained; what it raises ends the job.
+        progress: Called with (steps done, steps in all), first while the constants are chosen, then
+            from 1 again for each dimension trained; what it raises ends the job.
 
     Raises:
         InputError: There is no frame, or the dimensions of the clips differ.
