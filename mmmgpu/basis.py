@@ -1,0 +1,50 @@
+"""The multidimensional morphable model proper: prototypes, their flows, and where they count."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.regions import Region, lip_mask, mouth_mask
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Prototype images I_i and flows C_i of one person's mouth region (CE05, Eq. 1-2).
+
+    images: (M, h, w, 3) RGB in [0, 1].
+    flows: (M, h, w, 2) [px] from the reference to each prototype; that of the reference is 0.
+    reference: which prototype is the reference.
+    region: where the prototypes lie in the reference frame.
+    w_f: lip mask, (h, w) in [0, 1]: where flows are compared.
+    w_t: mouth mask, (h, w) in [0, 1]: where textures are compared, and what is composited.
+    """
+
+    images: F32
+    flows: F32
+    reference: int
+    region: Region
+    w_f: F32
+    w_t: F32
+
+    @property
+    def moving(self) -> NDArray[np.int64]:
+        """The prototypes other than the reference: the M - 1 dimensions of alpha."""
+        return np.delete(np.arange(len(self.images)), self.reference)
+
+    def flow(self, alpha: NDArray[np.floating]) -> F32:
+        """Eq. 1: ``C_syn = sum_i alpha_i C_i``; alpha (M - 1,) -> (h, w, 2) [px]."""
+        weights = np.insert(alpha, self.reference, 0.0).astype(np.float32)
+        summed: F32 = np.tensordot(weights, self.flows, axes=1)
+        return summed
+
+
+def make_basis(images: F32, flows: F32, reference: int, region: Region) -> Basis:
+    """A `Basis` whose flows fade to 0 where the mouth mask does: outside, the head is rigid."""
+    w_t = mouth_mask(region)
+    window = np.minimum(1, 2 * w_t)[..., None]
+    still = flows * window
+    still[reference] = 0
+    return Basis(images, still.astype(np.float32), reference, region, lip_mask(region), w_t)

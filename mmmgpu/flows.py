@@ -1,0 +1,118 @@
+"""Dense optical flow and its concatenation along paths of similar frames (EGP02, DESIGN 5.5).
+
+A flow a -> b, shape (H, W, 2) = (dx, dy) [px], says where the pixels of a are found in b. Direct
+flow fails where two pictures differ much; a path through pictures that resemble each other does
+not.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+Matcher = Callable[[F32, F32], F32]
+
+NEIGHBOURS = 8  # edges of a frame in the graph
+
+
+def matcher(name: str = "dis") -> Matcher:
+    """A function (image a, image b) -> flow a -> b [px] for RGB images in [0, 1], (H, W, 3).
+
+    name: ``"dis"`` (dense inverse search, Kroeger et al. 2016), ``"farneback"`` or ``"tvl1"``.
+    """
+    algorithm = _ALGORITHMS[name]()
+
+    def flow(a: F32, b: F32) -> F32:
+        found: F32 = algorithm.calc(_gray(a), _gray(b), None)
+        return found
+
+    return flow
+
+
+def _dis() -> Any:
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    dis.setGradientDescentIterations(25)
+    return dis
+
+
+_ALGORITHMS: dict[str, Callable[[], Any]] = {
+    "dis": _dis,
+    "farneback": cv2.FarnebackOpticalFlow_create,
+    "tvl1": cv2.optflow.DualTVL1OpticalFlow_create,
+}
+MATCHERS = tuple(_ALGORITHMS)
+
+
+def _gray(image: F32) -> NDArray[np.uint8]:
+    bytes_ = np.clip(image * 255 + 0.5, 0, 255).astype(np.uint8)
+    gray: NDArray[np.uint8] = cv2.cvtColor(bytes_, cv2.COLOR_RGB2GRAY)
+    return gray
+
+
+def pull(field: F32, flow: F32) -> F32:
+    """`field` read at p + flow(p): backward warp, bilinear, border repeated. Shape of `field`."""
+    h, w = flow.shape[:2]
+    x = np.arange(w, dtype=np.float32) + flow[..., 0]
+    y = np.arange(h, dtype=np.float32)[:, None] + flow[..., 1]
+    seen: F32 = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return seen
+
+
+def concatenate(first: F32, second: F32) -> F32:
+    """Flow a -> c from flows a -> b and b -> c: ``C(p) = first(p) + second(p + first(p))``."""
+    return first + pull(second, first)
+
+
+def explanation_error(reference: F32, image: F32, flow: F32, mask: F32) -> float:
+    """How badly `flow` explains `image`: mean squared difference of the pulled image, weighted."""
+    miss = ((pull(image, flow) - reference) ** 2).mean(axis=-1)
+    return float((mask * miss).sum() / mask.sum())
+
+
+def best_flow(
+    reference: F32, image: F32, mask: F32, via: list[tuple[F32, F32]], match: Matcher
+) -> F32:
+    """The flow reference -> image that explains the image best: direct, or through a waypoint.
+
+    via: waypoints as (waypoint image, flow reference -> waypoint).
+    """
+    flows = [match(reference, image)]
+    flows += [concatenate(to_waypoint, match(waypoint, image)) for waypoint, to_waypoint in via]
+    errors = [explanation_error(reference, image, f, mask) for f in flows]
+    return flows[int(np.argmin(errors))]
+
+
+def shortest_paths(coordinates: NDArray[np.floating[Any]], start: int) -> NDArray[np.int64]:
+    """Predecessor of every frame on its shortest path from `start`, shape (N,); `start`: -1.
+
+    Dijkstra on the graph of the `NEIGHBOURS` nearest frames; an edge is as long as the Euclidean
+    distance of the whitened PCA coordinates, shape (N, d), which is Mahalanobis. Parts of the graph
+    that do not touch are joined by an edge from `start`.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import dijkstra
+    from scipy.spatial import cKDTree
+
+    n = len(coordinates)
+    distance, neighbour = cKDTree(coordinates).query(coordinates, k=min(NEIGHBOURS + 1, n))
+    distance, neighbour = distance.reshape(n, -1), neighbour.reshape(n, -1)
+    rows = np.repeat(np.arange(n), neighbour.shape[1])
+    lengths = distance.ravel() + 1e-9  # equal frames still need an edge
+    edges = csr_matrix((lengths, (rows, neighbour.ravel())), shape=(n, n))
+    length, before = dijkstra(edges, directed=False, indices=start, return_predecessors=True)
+    before = before.astype(np.int64)
+    before[~np.isfinite(length)] = start
+    before[start] = -1
+    return before
+
+
+def path_to(target: int, before: NDArray[np.int64]) -> list[int]:
+    """Frames from the start of `before` (see `shortest_paths`) to `target`, both included."""
+    path = [target]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    return path[::-1]
