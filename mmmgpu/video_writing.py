@@ -8,7 +8,7 @@ and most players show. Padding would change the size.
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -41,12 +41,15 @@ class _Recipe:
     video_options: dict[str, str]
     audio: str
     audio_format: str
+    audio_options: dict[str, str]
 
 
-_LOSSY = _Recipe("libx264", "yuv420p", {"preset": "veryfast", "crf": "16"}, "aac", "fltp")
-_X264RGB = _Recipe("libx264rgb", "rgb24", {"preset": "veryfast", "crf": "0"}, "flac", "s32")
-_FFV1 = _Recipe("ffv1", "bgr0", {"level": "3", "slices": "4"}, "pcm_f32le", "flt")
-_LOSSLESS = {".mkv": _FFV1, ".mp4": _X264RGB, ".mov": _X264RGB}
+_FAST = {"aac_coder": "fast"}  # at 192 kbit/s 10 dB closer to speech than the default "twoloop"
+_LOSSY = _Recipe("libx264", "yuv420p", {"preset": "veryfast", "crf": "16"}, "aac", "fltp", _FAST)
+_X264RGB = _Recipe("libx264rgb", "rgb24", {"preset": "veryfast", "crf": "0"}, "flac", "s32", {})
+_FFV1 = _Recipe("ffv1", "bgr0", {"level": "3", "slices": "4"}, "pcm_f32le", "flt", {})
+_QUICKTIME = replace(_X264RGB, audio="pcm_f32le", audio_format="flt")
+_LOSSLESS = {".mkv": _FFV1, ".mp4": _X264RGB, ".mov": _QUICKTIME}
 _FORMATS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov"}
 
 
@@ -62,7 +65,8 @@ def write_video(
 
     `sound` is (samples (n,) or (n, 2) in [-1, 1], rate); its first sample belongs to the beginning
     of the first frame. The suffix chooses the file: .mp4, .mov or .mkv, H.264 + AAC; with
-    `lossless` exact RGB: FFV1 + float PCM in .mkv, H.264 in RGB + 24-bit FLAC in .mp4 and .mov.
+    `lossless` exact RGB: FFV1 in .mkv (the fastest), H.264 in RGB in .mp4 and .mov, and sound
+    as float samples, in .mp4 as 24-bit FLAC.
     The file appears when it is complete; on any exception nothing of it remains.
 
     Raises InputError for another suffix, for no frames, for frames of different sizes, and where
@@ -159,7 +163,7 @@ def _open_sound(
     if sound is None:
         return lambda until: None
     samples, rate = _playable(sound, recipe)
-    stream: Any = media.add_stream(recipe.audio, rate=rate)
+    stream: Any = media.add_stream(recipe.audio, rate=rate, options=recipe.audio_options)
     stream.layout = "stereo" if samples.shape[1] == 2 else "mono"
     stream.format = recipe.audio_format
     if recipe.audio == "aac":

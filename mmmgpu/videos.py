@@ -196,7 +196,8 @@ def _check_promises(
             f"{path}: truncated: {found} of {stream.frames} frames are there; {_COMPLETE}"
         )
     promised = (media.duration or 0) / av.time_base
-    if "matroska" in media.format.name and end < promised - 0.5:
+    slack = 2 / float(stream.average_rate or 25)
+    if "matroska" in media.format.name and end < promised - slack:
         raise InputError(f"{path}: truncated: ends at {end:.2f} s of {promised:.2f} s; {_COMPLETE}")
 
 
@@ -258,11 +259,13 @@ def _stray(times: NDArray[np.float64], rate: Fraction) -> float:
 
 
 def _usual_rate(times: NDArray[np.float64]) -> Fraction:
-    """Return the standard rate of the median interval; if none is within 5 %, its own rate."""
-    median = min(max(1.0 / max(float(np.median(np.diff(times))), 1e-6), 1.0), 120.0)
-    standard = min(STANDARD_RATES, key=lambda r: abs(float(r) - median))
-    close = abs(float(standard) - median) <= 0.05 * median
-    return standard if close else Fraction(median).limit_denominator(1001)
+    """Return the rate of the intervals without a missing frame, where possible a standard one."""
+    gaps = np.diff(times)
+    gaps = gaps[gaps > 1 / 240] if np.any(gaps > 1 / 240) else np.array([1 / 25])
+    usual = 1 / float(gaps[gaps < 1.5 * np.quantile(gaps, 0.2)].mean())
+    standard = min(STANDARD_RATES, key=lambda r: abs(float(r) - usual))
+    close = abs(float(standard) - usual) <= 0.05 * usual
+    return standard if close else Fraction(usual).limit_denominator(1001)
 
 
 def _nearest_in_time(times: NDArray[np.float64], rate: Fraction) -> NDArray[np.int64]:

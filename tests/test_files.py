@@ -1,0 +1,124 @@
+import errno
+import json
+import os
+
+import pytest
+
+from mmmgpu.errors import InputError
+from mmmgpu.files import atomic_path, require_folder, write_bytes, write_json, write_text
+
+
+@pytest.mark.parametrize(
+    "name", ["a.json", "with space.json", "-f.json", "día_日本.json", "x" * 250]
+)
+def test_the_file_appears_at_the_end(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with atomic_path(name) as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.name.startswith(".")
+        assert temporary.suffix == os.path.splitext(name)[1]
+        temporary.write_text("new")
+        assert not os.path.exists(name)
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [(name, "new")]
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    (tmp_path / "plain").touch()
+    write_text(tmp_path / "ours", "text")
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+@pytest.mark.parametrize("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(3)])
+@pytest.mark.parametrize("old", [None, "old"])
+def test_an_exception_leaves_what_was_there(tmp_path, error, old):
+    if old:
+        (tmp_path / "a").write_text(old)
+
+    def interrupted():
+        with atomic_path(tmp_path / "a") as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises(type(error)) as caught:
+        interrupted()
+    assert caught.value is error
+    assert [p.read_text() for p in tmp_path.iterdir()] == ([old] if old else [])
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.ENOSPC, "the disk is full"),
+        (errno.EDQUOT, "the disk quota is used up"),
+        (errno.EACCES, "permission denied"),
+        (errno.EROFS, "the file system is read-only"),
+        (errno.EIO, "input/output error"),
+    ],
+)
+def test_what_the_system_refuses_is_one_line(tmp_path, code, words):
+    def refused():
+        with atomic_path(tmp_path / "a.json") as temporary:
+            temporary.write_text("half")
+            raise OSError(code, os.strerror(code))
+
+    with pytest.raises(InputError, match=words) as error:
+        refused()
+    assert str(error.value).startswith(f"cannot write {tmp_path / 'a.json'}: ")
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_about_other_files_are_not_blamed_on_this_one(tmp_path):
+    def reading_another():
+        with atomic_path(tmp_path / "a"):
+            (tmp_path / "missing").read_text()
+
+    with pytest.raises(FileNotFoundError, match="missing"):
+        reading_another()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_no_folder(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    for path, words in [
+        (tmp_path / "file" / "a", "a part of the path is a file"),
+        (tmp_path / "missing" / "a", "the folder does not exist"),
+        (tmp_path / "folder", "it is a folder"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            write_bytes(path, b"")
+    with pytest.raises(InputError, match=r"cannot create the folder .*file: a file of that name"):
+        require_folder(tmp_path / "file")
+    with pytest.raises(InputError, match=r"cannot create the folder .*is a file, not a folder"):
+        require_folder(tmp_path / "file" / "below")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_a_folder_that_may_not_be_written(tmp_path, monkeypatch):
+    """The superuser may write everywhere, so the system's answer is made up here."""
+
+    def refuse(path, *_):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr("os.open", refuse)
+    with pytest.raises(InputError, match="permission denied: choose"):
+        write_text(tmp_path / "a", "text")
+
+
+def test_folders_are_made_with_their_parents(tmp_path):
+    assert require_folder(tmp_path / "a" / "b c") == tmp_path / "a" / "b c"
+    assert require_folder(str(tmp_path / "a" / "b c")).is_dir()
+
+
+def test_text_and_json_come_back(tmp_path):
+    write_text(tmp_path / "t", "é\r\nñ\n")
+    assert (tmp_path / "t").read_bytes() == "é\r\nñ\n".encode()
+    value = {"b": [1, 2.5, None], "a": "日本"}
+    write_json(tmp_path / "j", value)
+    text = (tmp_path / "j").read_text(encoding="utf-8")
+    assert json.loads(text) == value
+    assert "日本" in text
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "n", float("nan"))
+    assert not (tmp_path / "n").exists()
