@@ -11,6 +11,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -71,6 +72,14 @@ def cover(segments: Iterable[Segment], duration: float) -> tuple[Segment, ...]:
     if now < duration:
         append(SIL, now, duration)
     return tuple(covered)
+
+
+def spread(labels: Sequence[str], start: float, end: float) -> list[Segment]:
+    """Return `labels` spread over [start, end] [s], a vowel as long as two consonants."""
+    shares = [2 if label in VOWELS else 1 for label in labels]
+    parts = [sum(shares[:i]) / sum(shares) for i in range(len(labels) + 1)]
+    times = [start + part * (end - start) for part in parts[:-1]] + [end]
+    return [Segment(label, *time) for label, time in zip(labels, pairwise(times), strict=True)]
 
 
 def read_alignment(path: str | os.PathLike[str]) -> Alignment:
@@ -262,20 +271,19 @@ def _from_grid(text: str, path: Path) -> tuple[float, list[Row], list[Row]]:
         for line, start, end, (label, *_), _ in _columns(text, path)
     ]
     words = _spoken(rows)
-    return max(row.end for row in rows), [p for word in words for p in _spread(word)], words
+    return max(row.end for row in rows), [p for word in words for p in _spoken_phones(word)], words
 
 
-def _spread(word: Row) -> Iterator[Row]:
-    """Yield the phones of `word`, a vowel as long as two consonants."""
+def _spoken_phones(word: Row) -> Iterator[Row]:
     from mmmgpu.pronunciation import letter_name, pronounce
 
     is_letter = len(word.label) == 1 and word.label.isalpha()
     labels = letter_name(word.label) if is_letter else pronounce(word.label)
-    shares = [2 if label in VOWELS else 1 for label in labels]
-    unit = (word.end - word.start) / sum(shares)
-    for i, label in enumerate(labels):
-        start = word.start + unit * sum(shares[:i])
-        yield Row(label, start, start + unit * shares[i], word.line)
+    if not word.start < word.end:
+        yield word  # to be reported with its line
+        return
+    for segment in spread(labels, word.start, word.end):
+        yield Row(*segment, word.line)
 
 
 def _from_htk(text: str, path: Path) -> tuple[float, list[Row], list[Row]]:
