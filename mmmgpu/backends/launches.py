@@ -1,0 +1,171 @@
+"""The operations as sequences of kernel launches, the same for every runtime that has the kernels.
+
+A runtime (Warp, OpenCL) is a subclass that knows how to hold arrays and how to launch.
+"""
+
+import functools
+import itertools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.arrays import check_some_valid
+
+GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
+GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
+LANES = 16  # floats of a vector, as in kernels/blend and kernels/distance_scan
+TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the pull-push pyramid: a cell is valid where its weight reaches `threshold`."""
+
+    value: Any  # (B, h, w, C)
+    weight: Any  # (B, h, w)
+    threshold: float
+
+
+@dataclass(frozen=True)
+class Launches(ABC):
+    """The operations of `mmmgpu.backends.Backend`, over five things that a runtime can do."""
+
+    workers: int  # accumulators of a forward warp
+
+    @abstractmethod
+    def to_device(self, array: NDArray[Any]) -> Any: ...
+
+    @abstractmethod
+    def to_host(self, array: Any) -> Any: ...
+
+    @abstractmethod
+    def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
+        """An uninitialised device array."""
+
+    @abstractmethod
+    def copy(self, target: Any, source: Any, first: int, count: int) -> None:
+        """Copy the items `first` ... `first + count - 1` of the first axis."""
+
+    @abstractmethod
+    def launch(
+        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
+    ) -> None:
+        """Run ``stem.name`` for the items `first` ... `first + count - 1`.
+
+        The kernel's arguments are `inputs`, first, count and `outputs`.
+        """
+
+    @abstractmethod
+    def split(self, count: int, work: Callable[[int, int], None]) -> None:
+        """Call `work(first, n)` for contiguous parts of `count` items, on all threads."""
+
+    def launch_all(self, kernel: str, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """Run a kernel for the items 0 ... `count` - 1 on all threads."""
+        self.split(count, lambda first, n: self.launch(kernel, first, n, inputs, outputs))
+
+    def forward_warp(self, field: Any, flow: Any) -> tuple[Any, Any]:
+        fields, height, width, channels = field.shape
+        flows = flow.shape[0]
+        batch = max(fields, flows)
+        bands = min(height, math.ceil(self.workers / batch))
+        rows = math.ceil(height / bands)
+        total = self.empty(self.workers, rows, width, GROUP, dtype=np.float64)
+        mass = self.empty(self.workers, rows, width, dtype=np.float64)
+        warped = self.empty(batch, height, width, channels)
+        weight = self.empty(batch, height, width)
+        for channel in range(0, channels, GROUP):
+            sizes = [fields, flows, batch, height, width, channels, channel, bands, self.workers]
+            inputs, outputs = [field, flow, *sizes], [total, mass, warped, weight]
+            self.launch_all("forward_warp.forward_warp", self.workers, inputs, outputs)
+        return warped, weight
+
+    def fill_holes(self, field: Any, weight: Any, threshold: float) -> Any:
+        batch, height, width, _ = field.shape
+        valid = self.empty(batch, height, dtype=np.int32)
+        inputs = [weight, float(threshold), width]
+        self.launch_all("fill_holes.count_valid", batch * height, inputs, [valid])
+        number = self.to_host(valid).sum(axis=1)
+        check_some_valid(number)
+        holes = number < height * width
+        if not holes.any():
+            return field
+        flags = self.to_device(holes.astype(np.int32))
+        levels = [Level(self.empty(*field.shape), weight, float(threshold))]
+        while levels[-1].value.shape[1:3] != (1, 1):
+            levels.append(self._coarser(levels[-1]))
+        self.split(batch, functools.partial(self._pull_push, field, flags, levels))
+        return levels[0].value
+
+    def blend(self, images: Any, weights: Any) -> Any:
+        number, *shape = images.shape
+        batch = weights.shape[0]
+        size = math.prod(shape)
+        blended = self.empty(batch, *shape)
+        inputs = [images, weights, number, size]
+        self.launch_all("blend.blend", batch * (size // LANES), inputs, [blended])
+        self.launch_all("blend.blend_rest", batch * (size % LANES), inputs, [blended])
+        return blended
+
+    def sample(self, field: Any, points: Any) -> Any:
+        fields, height, width, channels = field.shape
+        sets, number, _ = points.shape
+        batch = max(fields, sets)
+        sampled = self.empty(batch, number, channels)
+        inputs = [field, points, fields, sets, number, height, width, channels]
+        self.launch_all("sample.sample", batch * number, inputs, [sampled])
+        return sampled
+
+    def distance_scan(self, queries: Any, corpus: Any, weights: Any) -> Any:
+        number, points, channels = queries.shape
+        rows = corpus.shape[0]
+        packed = self._packed(queries, points, channels, 0, number)
+        shares = self._packed(weights, points, 1, 0, 1)
+        distance = self.empty(number, rows)
+        pairs = math.ceil(number / 2)
+        sizes = [number, rows, math.ceil(points / LANES), channels]
+
+        def scan(first: int, count: int) -> None:
+            for start in range(first, first + count, TILE):
+                tile = min(TILE, first + count - start)
+                planes = self._packed(corpus, points, channels, start, tile)
+                inputs = [packed, planes, shares, *sizes]
+                span = start * pairs, tile * pairs
+                self.launch("distance_scan.distance_scan", *span, inputs, [distance])
+
+        self.split(rows, scan)
+        return distance
+
+    def _coarser(self, level: Level) -> Level:
+        """An uninitialised level of half the size; its weights are numbers of valid pixels."""
+        batch, height, width, channels = level.value.shape
+        half = (batch, (height + 1) // 2, (width + 1) // 2)
+        return Level(self.empty(*half, channels), self.empty(*half), threshold=0.5)
+
+    def _pull_push(
+        self, field: Any, holes: Any, levels: list[Level], first: int, count: int
+    ) -> None:
+        """Fill the images `first` ... `first + count - 1`: down the levels, and up again."""
+        self.copy(levels[0].value, field, first, count)
+        pairs = list(itertools.pairwise(levels))
+        for fine, coarse in pairs:
+            rows = coarse.value.shape[1]
+            finest = int(fine is levels[0])
+            inputs = [holes, fine.value, fine.weight, fine.threshold, finest]
+            inputs += fine.value.shape[1:]
+            outputs = [coarse.value, coarse.weight]
+            self.launch("fill_holes.pull", first * rows, count * rows, inputs, outputs)
+        for fine, coarse in reversed(pairs):
+            rows = fine.value.shape[1]
+            inputs = [holes, fine.weight, coarse.value, fine.threshold, *fine.value.shape[1:]]
+            self.launch("fill_holes.push", first * rows, count * rows, inputs, [fine.value])
+
+    def _packed(self, fields: Any, points: int, channels: int, first: int, count: int) -> Any:
+        """Rows of `fields` (N, P, C) as padded planes, shape (count, C, V * 16)."""
+        planes = self.empty(count, channels, math.ceil(points / LANES) * LANES)
+        self.launch("distance_scan.pack", first, count, [fields, points, channels], [planes])
+        return planes

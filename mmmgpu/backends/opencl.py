@@ -1,0 +1,112 @@
+"""OpenCL runtime (kernels/*.cl), with PoCL from the wheel where there is no other driver.
+
+Buffers only: no images, no local memory, no barriers; every kernel tests its own bounds. Local
+sizes are fixed, for PoCL compiles a kernel anew for each.
+"""
+
+import functools
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+from numpy.typing import NDArray
+
+from mmmgpu.arrays import F32
+from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.pocl_cpu import name_unknown_cpu
+from mmmgpu.errors import InputError
+
+LOCAL = 16  # work-items of a group; 1 where there are too few to go round
+THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # PoCL before and after 4.0
+
+
+def open_backend(device: str, threads: int) -> "OpenCL":
+    """The backend on an OpenCL device: "" for the first CPU (else the first of all), or "0:0"."""
+    for variable in THREADS:  # read when the driver is loaded, on the first call below
+        os.environ.setdefault(variable, str(threads))
+    name_unknown_cpu()
+    present = {
+        f"{i}:{j}": d
+        for i, platform in enumerate(cl.get_platforms())
+        for j, d in enumerate(platform.get_devices())
+    }
+    cpus = [name for name, d in present.items() if d.type & cl.device_type.CPU]
+    chosen = device or next(iter([*cpus, *present]), "")
+    if chosen not in present:
+        known = ", ".join(f"opencl:{name} ({d.name})" for name, d in present.items()) or "none"
+        raise InputError(f"there is no device 'opencl:{device}'; present: {known}")
+    found = present[chosen]
+    if not found.double_fp_config:
+        raise InputError(f"device 'opencl:{chosen}' has no float64; choose another")
+    queue = cl.CommandQueue(cl.Context([found]))
+    on_cpu = bool(found.type & cl.device_type.CPU)
+    return OpenCL(found.max_compute_units if on_cpu else GPU_WORKERS, queue)
+
+
+@dataclass(frozen=True)
+class OpenCL(Launches):
+    """Device arrays are `pyopencl.array.Array`."""
+
+    queue: Any
+
+    def to_device(self, array: NDArray[Any]) -> Any:
+        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
+        data = cl.Buffer(self.queue.context, flags, hostbuf=array)
+        return cl.array.Array(self.queue, array.shape, array.dtype, data=data)
+
+    def to_host(self, array: Any) -> F32:
+        host: F32 = array.get()
+        return host
+
+    def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
+        return cl.array.empty(self.queue, shape, dtype)
+
+    def copy(self, target: Any, source: Any, first: int, count: int) -> None:
+        row = source.strides[0]
+        span = {"src_offset": first * row, "dst_offset": first * row, "byte_count": count * row}
+        cl.enqueue_copy(self.queue, target.data, source.data, **span)
+
+    def launch(
+        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
+    ) -> None:
+        local = LOCAL if count >= LOCAL * self.queue.device.max_compute_units else 1
+        padded = -(-count // local) * local
+        arguments = [_argument(a) for a in (*inputs, first, count, *outputs)]
+        with _launching:
+            _kernel(self.queue.context, kernel)(self.queue, (padded,), (local,), *arguments)
+
+    def split(self, count: int, work: Callable[[int, int], None]) -> None:
+        """The driver has the threads. Wait for it: the memory of an input may be NumPy's."""
+        if count:
+            work(0, count)
+            self.queue.finish()
+
+
+_launching = threading.Lock()  # a kernel object holds the arguments of one launch
+
+
+@functools.cache
+def _kernel(context: Any, kernel: str) -> Any:
+    """The kernel ``stem.name``, built on first use."""
+    stem, _, name = kernel.partition(".")
+    return cl.Kernel(_program(context, stem), name)
+
+
+@functools.cache
+def _program(context: Any, stem: str) -> Any:
+    source = files("mmmgpu.kernels").joinpath(f"{stem}.cl").read_text()
+    return cl.Program(context, source).build(cache_dir=False)  # the driver has a cache of its own
+
+
+def _argument(argument: Any) -> Any:
+    if isinstance(argument, int):
+        return np.int32(argument)
+    if isinstance(argument, float):
+        return np.float32(argument)
+    return argument.data
