@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .files import atomic_path
+from .videos import ACCURATE_ROUNDING, FULL_CHROMA_IN
 
 Sound = tuple[NDArray[np.float32], int]
 
-_FLAGS = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INP
+_FLAGS = int(Interpolation.BICUBIC) | ACCURATE_ROUNDING | FULL_CHROMA_IN
 _AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000, 64000, 88200, 96000)
 # AVColorSpace, AVColorPrimaries, AVColorTransferCharacteristic (one number in each)
 _BT709, _BT601_625, _BT601 = 1, 5, 6

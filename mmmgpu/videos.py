@@ -31,7 +31,9 @@ STANDARD_RATES = (
 )
 _STEADY = 0.25  # of a frame: a clock that strays no further from constant is taken as constant
 _LONGEST_GAP_S = 10.0  # between two frames; more is a broken clock, not a variable rate
-_EXACT = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+# libswscale's flags for unbiased rounding and chroma at full width (av < 18 does not name them)
+ACCURATE_ROUNDING, FULL_CHROMA_OUT, FULL_CHROMA_IN = 0x40000, 0x2000, 0x4000
+_EXACT = int(Interpolation.BILINEAR) | ACCURATE_ROUNDING | FULL_CHROMA_OUT
 _UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
 _COMPLETE = "copy or download it again"
 

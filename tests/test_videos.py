@@ -1,3 +1,4 @@
+import itertools
 from fractions import Fraction
 from pathlib import Path
 
@@ -128,10 +129,10 @@ def test_variable_rate_becomes_the_nearest_frame_in_time(tmp_path, suffix, seed)
 
 
 def test_a_part_of_variable_rate_is_that_part(tmp_path):
-    ms = [0, 40, 80, 300, 340, 380, 420, 460]
+    ms = [0, 40, 80, 310, 350, 390, 430, 470]
     path = encode(tmp_path / "a.mkv", grey_levels(8), ticks=ms, clock=1000)
     everything = which(read_frames(path), 8)
-    assert everything == [0, 1, 2, 2, 2, 3, 3, 3, 4, 5, 6, 7] or everything.count(2) > 1
+    assert everything == [0, 1, 2, 2, 2, 3, 3, 3, 3, 4, 5, 6, 7]
     assert which(read_frames(path, start=3, stop=7), 8) == everything[3:7]
 
 
@@ -152,16 +153,21 @@ def test_a_late_start_and_a_broken_clock_lose_no_frame(tmp_path):
         assert which(read_frames(path), 9) == list(range(9))
 
 
-@pytest.mark.parametrize(("matrix", "weights"), [(1, (0.2126, 0.0722)), (5, (0.299, 0.114))])
-@pytest.mark.parametrize("full", [False, True])
-@pytest.mark.parametrize("height", [48, 720])
-@pytest.mark.parametrize("tagged", [False, True])
-def test_colours_are_those_of_the_tags(tmp_path, matrix, weights, full, height, tagged):
+REC_709, REC_601 = 1, 5
+
+
+@pytest.mark.parametrize(
+    ("matrix", "full", "height", "tagged"),
+    [
+        *itertools.product((REC_709, REC_601), (False, True), (48, 720), (True,)),
+        (REC_601, False, 48, False),
+        (REC_709, False, 720, False),
+    ],
+)
+def test_colours_are_those_of_the_tags(tmp_path, matrix, full, height, tagged):
     """Y, Cb, Cr of known colours by the standards' own formulae; untagged: 601, or 709 in HD."""
-    if not tagged and (full or (matrix == 1) != (height == 720)):
-        pytest.skip("the custom for untagged files says otherwise")
     colours = np.array([[200, 30, 40], [30, 180, 60], [50, 60, 220], [128, 128, 128]], float)
-    red, blue = weights
+    red, blue = (0.2126, 0.0722) if matrix == REC_709 else (0.299, 0.114)
     luma = colours @ [red, 1 - red - blue, blue]
     cb = (colours[:, 2] - luma) / (2 - 2 * blue)
     cr = (colours[:, 0] - luma) / (2 - 2 * red)
