@@ -6,7 +6,6 @@ acoustic model is that of pocketsphinx's wheel; nothing is trained or downloaded
 
 import re
 from functools import lru_cache
-from math import gcd
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -81,7 +80,7 @@ def align_speech(samples: ArrayLike, rate: int, transcript: str) -> Alignment:
         raise InputError(f"the transcript {transcript[:40]!r} has no words; give what is said")
     pronunciations = {word: pronounce(word) for word in words if word not in dictionary()}
     duration = len(sound) / rate
-    at_model_rate = _resampled(sound, rate)
+    at_model_rate = _at_model_rate(sound, rate)
     for attempt in _ATTEMPTS:
         found = _search(at_model_rate, words, pronunciations, attempt)
         if found and _mean_score(found) >= POOREST_SCORE:
@@ -102,20 +101,18 @@ def _checked_sound(samples: ArrayLike, rate: int) -> NDArray[np.float64]:
         raise InputError("samples must be finite; there is NaN or infinity in the sound")
     if rate <= 0:
         raise InputError(f"rate must be > 0 samples a second, got {rate}")
-    if not sound.any():
-        raise InputError("the sound is silent throughout; give a clip with speech")
     return sound
 
 
-def _resampled(sound: NDArray[np.float64], rate: int) -> NDArray[np.float64]:
+def _at_model_rate(sound: NDArray[np.float64], rate: int) -> NDArray[np.float64]:
     """Return `sound` at MODEL_RATE and PEAK."""
-    from scipy.signal import resample_poly
+    from mmmgpu.sounds import resample
 
-    if rate != MODEL_RATE:
-        common = gcd(rate, MODEL_RATE)
-        sound = resample_poly(sound, MODEL_RATE // common, rate // common)
-    peak: NDArray[np.float64] = sound * (PEAK / np.abs(sound).max())
-    return peak
+    samples = resample(sound.astype(np.float32), rate, MODEL_RATE).astype(np.float64)
+    peak: float = np.abs(samples).max(initial=0.0)
+    if not peak:
+        raise InputError("the sound is silent or too short; give a clip with speech")
+    return samples * (PEAK / peak)
 
 
 def _search(

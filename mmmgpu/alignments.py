@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mmmgpu.errors import InputError
+from mmmgpu.files import write_text
 from mmmgpu.phones import SIL, VOWELS, normalise_label
 from mmmgpu.textgrid import Row, Tier, format_textgrid, parse_textgrid
 
 SUFFIXES = (".TextGrid", ".textgrid", ".align", ".lab")  # in order of preference
-GRID_UNIT = 1 / 25000  # s
-HTK_UNIT = 1e-7  # s
+GRID_RATE = 25_000  # units a second
+HTK_RATE = 10_000_000
 SNAP = 1e-4  # s; smaller gaps and overlaps are rounding of the writer
 
 
@@ -77,8 +78,8 @@ def cover(segments: Iterable[Segment], duration: float) -> tuple[Segment, ...]:
 def spread(labels: Sequence[str], start: float, end: float) -> list[Segment]:
     """Return `labels` spread over [start, end] [s], a vowel as long as two consonants."""
     shares = [2 if label in VOWELS else 1 for label in labels]
-    parts = [sum(shares[:i]) / sum(shares) for i in range(len(labels) + 1)]
-    times = [start + part * (end - start) for part in parts[:-1]] + [end]
+    parts = [sum(shares[:i]) / sum(shares) for i in range(len(labels))]
+    times = [*(start + part * (end - start) for part in parts), end]
     return [Segment(label, *time) for label, time in zip(labels, pairwise(times), strict=True)]
 
 
@@ -100,10 +101,11 @@ def read_alignment(path: str | os.PathLike[str]) -> Alignment:
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: is no alignment; give one of {', '.join(SUFFIXES)}")
     duration, phones, words = readers[path.suffix.lower()](_read_text(path), path)
+    phone_segments = _checked(phones, duration, path)
+    word_segments = _checked(words, duration, path)
     if not (math.isfinite(duration) and duration > 0):
-        raise InputError(f"{path}: the end time must be > 0 s, got {duration}")
-    spoken = _checked(words, duration, path)
-    return Alignment(cover(_checked(phones, duration, path), duration), tuple(spoken), duration)
+        raise InputError(f"{path}: the end time must be > 0 s, got {duration}; correct it")
+    return Alignment(cover(phone_segments, duration), tuple(word_segments), duration)
 
 
 def write_textgrid(alignment: Alignment, path: str | os.PathLike[str]) -> None:
@@ -112,18 +114,11 @@ def write_textgrid(alignment: Alignment, path: str | os.PathLike[str]) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    path = Path(path)
     words = cover(alignment.words, alignment.duration)
     blank = [(label if label != SIL else "", start, end) for label, start, end in words]
     phones = cover(alignment.phones, alignment.duration)
     text = format_textgrid([("words", blank), ("phones", phones)])
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another") from error
+    write_text(path, text)
 
 
 def find_alignment(place: str | os.PathLike[str], clip: str | os.PathLike[str]) -> Path:
@@ -267,7 +262,7 @@ def _tier(tiers: Sequence[Tier], names: tuple[str, ...], path: Path) -> Tier | N
 
 def _from_grid(text: str, path: Path) -> tuple[float, list[Row], list[Row]]:
     rows = [
-        Row(label, start * GRID_UNIT, end * GRID_UNIT, line)
+        Row(label, start / GRID_RATE, end / GRID_RATE, line)
         for line, start, end, (label, *_), _ in _columns(text, path)
     ]
     words = _spoken(rows)
@@ -287,28 +282,29 @@ def _spoken_phones(word: Row) -> Iterator[Row]:
 
 
 def _from_htk(text: str, path: Path) -> tuple[float, list[Row], list[Row]]:
-    columns = list(_columns(text, path))
-    unit = HTK_UNIT if all(whole for *_, whole in columns) else 1.0
+    columns = _columns(text, path)
+    rate = HTK_RATE if all(whole for *_, whole in columns) else 1.0
     rows = [
-        Row(_centre(labels[0]), start * unit, end * unit, line)
+        Row(_centre(labels[0]), start / rate, end / rate, line)
         for line, start, end, labels, _ in columns
     ]
     begun = [i for i, c in enumerate(columns) if len(c[3]) > 1 and not _is_number(c[3][-1])]
     words = [
         Row(columns[i][3][-1], rows[i].start, rows[j - 1].end, rows[i].line)
-        for i, j in zip(begun, [*begun[1:], len(rows)], strict=True)
+        for i, j in pairwise([*begun, len(rows)])
     ]
     return max(row.end for row in rows), _labelled(rows), _spoken(words)
 
 
 def _centre(label: str) -> str:
-    """Return b of the triphone a-b+c, x^a-b+c=y/A:... or b+c; other labels as they are."""
-    match = re.fullmatch(r"(?:[^-+]+-)?([^-+]+)\+.+", label)
+    """Return b of a-b+c, x^a-b+c=y/A:..., a-b or b+c; other labels as they are."""
+    match = re.fullmatch(r"(?:[^-+]+-)?([^-+]+)(?:\+.+)?", label)
     return match.group(1) if match else label
 
 
-def _columns(text: str, path: Path) -> Iterator[tuple[int, float, float, list[str], bool]]:
-    """Yield (line, start, end, the columns after them, both times are whole numbers)."""
+def _columns(text: str, path: Path) -> list[tuple[int, float, float, list[str], bool]]:
+    """Return (line, start, end, the columns after them, both times are whole numbers), not none."""
+    columns = []
     for line, content in enumerate(text.split("\n"), 1):
         parts = content.split()
         if not parts or content.startswith("#"):
@@ -318,7 +314,10 @@ def _columns(text: str, path: Path) -> Iterator[tuple[int, float, float, list[st
                 f"{path}:{line}: expected 'start end label', found {content[:40]!r}; correct it"
             )
         whole = parts[0].isdecimal() and parts[1].isdecimal()
-        yield line, float(parts[0]), float(parts[1]), parts[2:], whole
+        columns.append((line, float(parts[0]), float(parts[1]), parts[2:], whole))
+    if not columns:
+        raise InputError(f"{path}: holds no segments; make the alignment again")
+    return columns
 
 
 def _is_number(text: str) -> bool:
