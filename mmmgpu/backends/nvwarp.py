@@ -8,9 +8,12 @@ import functools
 import importlib
 import itertools
 import os
+import shutil
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -61,10 +64,11 @@ class Warp(Launches):
     def launch(
         self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
     ) -> None:
-        compiled, types = _kernel(kernel)
+        compiled, types = _kernel(kernel, self.device)
         given = [*inputs, first, count, *outputs]
         arguments = [_as_declared(a, t) for a, t in zip(given, types, strict=True)]
-        wp.launch(compiled, dim=count, inputs=arguments, device=self.device)
+        block = _block(self.device)
+        wp.launch(compiled, dim=count, inputs=arguments, device=self.device, block_dim=block)
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         edges = np.linspace(0, count, min(self.threads, count) + 1).astype(int).tolist()
@@ -76,11 +80,33 @@ class Warp(Launches):
 
 
 @functools.cache
-def _kernel(kernel: str) -> tuple[Any, list[Any]]:
-    """The Warp kernel ``stem.name`` and the declared types of its arguments."""
+def _kernel(kernel: str, device: str) -> tuple[Any, list[Any]]:
+    """The Warp kernel ``stem.name``, ready on `device`, and the declared types of its arguments."""
     stem, _, name = kernel.partition(".")
     compiled = getattr(importlib.import_module(f"mmmgpu.kernels.{stem}"), name)
+    with _compiling:
+        _load(compiled.module, device)
     return compiled, [argument.type for argument in compiled.adj.args]
+
+
+_compiling = threading.Lock()
+
+
+def _load(module: Any, device: str) -> None:
+    """Compile a kernel module or take it from Warp's cache; a damaged cache entry is rebuilt."""
+    target = wp.get_device(device)
+    block = _block(device)
+    try:
+        module.load(target, block)
+    except Exception:  # Warp raises whatever its parsers do
+        entry = Path(wp.config.kernel_cache_dir or "", module.get_module_identifier(block))
+        shutil.rmtree(entry, ignore_errors=True)
+        module.load(target, block)
+
+
+def _block(device: str) -> int:
+    """Threads of a block, the same when a kernel is compiled and when it is launched."""
+    return 1 if device == "cpu" else 256
 
 
 def _as_declared(argument: Any, declared: Any) -> Any:

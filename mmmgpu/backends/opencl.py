@@ -30,6 +30,7 @@ def open_backend(device: str, threads: int) -> "OpenCL":
     """The backend on an OpenCL device: "" for the first CPU (else the first of all), or "0:0"."""
     for variable in THREADS:  # read when the driver is loaded, on the first call below
         os.environ.setdefault(variable, str(threads))
+    os.environ.setdefault("POCL_KERNEL_CACHE", "0")  # a damaged entry would abort the process
     name_unknown_cpu()
     present = {
         f"{i}:{j}": d
@@ -101,7 +102,8 @@ def _kernel(context: Any, kernel: str) -> Any:
 @functools.cache
 def _program(context: Any, stem: str) -> Any:
     source = files("mmmgpu.kernels").joinpath(f"{stem}.cl").read_text()
-    return cl.Program(context, source).build(cache_dir=False)  # the driver has a cache of its own
+    program: Any = cl.Program(context, source)
+    return program.build(cache_dir=False)  # nor pyopencl's cache: it has stale locks
 
 
 def _argument(argument: Any) -> Any:

@@ -13,6 +13,7 @@ import mmap
 import platform
 import struct
 from pathlib import Path
+from typing import Any
 
 READ, WRITE, EXECUTE = mmap.PROT_READ, mmap.PROT_WRITE, mmap.PROT_EXEC
 
@@ -35,7 +36,7 @@ def _nearest_known_cpu() -> bytes:
     return b"haswell" if {"avx2", "fma", "bmi2", "movbe", "abm"} <= set(flags) else b"x86-64"
 
 
-def _return_copies_of(function: "ctypes._CFuncPtr", text: bytes) -> None:
+def _return_copies_of(function: Any, text: bytes) -> None:
     """Overwrite an x86-64 function by strdup(text): mov rdi, text; mov rax, strdup; jmp rax."""
     libc = ctypes.CDLL(None)
     address, strdup = (ctypes.cast(f, ctypes.c_void_p).value or 0 for f in (function, libc.strdup))
