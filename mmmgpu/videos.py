@@ -249,9 +249,8 @@ def _constant_rate(
         if _stray(times, rate) <= 1.5 * tick * float(rate):
             return rate, np.ones(len(times), np.int64)
     rate = min([*STANDARD_RATES, *declared], key=lambda r: _stray(times, r))
-    if _stray(times, rate) <= _STEADY:
-        return rate, np.ones(len(times), np.int64)
-    rate = _usual_rate(times)
+    if _stray(times, rate) > _STEADY:
+        rate = _usual_rate(times)
     return rate, _nearest_in_time(times, rate)
 
 

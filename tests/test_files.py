@@ -9,7 +9,7 @@ from mmmgpu.files import atomic_path, require_folder, write_bytes, write_json, w
 
 
 @pytest.mark.parametrize(
-    "name", ["a.json", "with space.json", "-f.json", "día_日本.json", "x" * 250]
+    "name", ["a.json", "with space.json", "-f.json", "día_日本.json", "x" * 255]
 )
 def test_the_file_appears_at_the_end(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
@@ -19,6 +19,8 @@ def test_the_file_appears_at_the_end(tmp_path, monkeypatch, name):
         assert temporary.suffix == os.path.splitext(name)[1]
         temporary.write_text("new")
         assert not os.path.exists(name)
+        inode = temporary.stat().st_ino
+    assert os.stat(name).st_ino == inode  # renamed, not copied
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [(name, "new")]
 
 
@@ -93,6 +95,18 @@ def test_a_folder_that_is_no_folder(tmp_path):
     with pytest.raises(InputError, match=r"cannot create the folder .*is a file, not a folder"):
         require_folder(tmp_path / "file" / "below")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_a_folder_in_the_way_is_found_before_the_work(tmp_path):
+    reached = []
+
+    def work():
+        with atomic_path(tmp_path) as temporary:
+            reached.append(temporary)
+
+    with pytest.raises(InputError, match="it is a folder"):
+        work()
+    assert reached == []
 
 
 def test_a_folder_that_may_not_be_written(tmp_path, monkeypatch):

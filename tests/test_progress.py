@@ -81,13 +81,14 @@ def test_quiet_prints_nothing(clock, capsys):
 
 def test_a_bar_on_a_terminal_and_nothing_on_the_output(monkeypatch, capsys):
     terminal = open_terminal(monkeypatch)
-    for outer in progress(["a", "b"], "Clips [1]"):
+    for outer in progress(["a", "b"], "Clips [red]"):
         for _ in progress(range(3), f"Frames of {outer}"):
             print("a result")
     shown = terminal.getvalue()
     assert capsys.readouterr().out == "a result\n" * 6
-    for words in ("Clips [1]", "0/2", "Frames of a", "Frames of b", "0/3"):
+    for words in ("Clips [red]", "0/2", "Frames of a", "Frames of b", "0/3"):
         assert words in shown
+    assert "\x1b[2K\x1b[1A\x1b[2K" in shown  # two lines are redrawn as one display
 
 
 @pytest.mark.parametrize("on_terminal", [True, False])

@@ -17,7 +17,7 @@ from mmmgpu.videos import probe, read_frames
 NTSC = Fraction(30000, 1001)
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "-a b.mp4", "día_日本:1%03d.MP4"])
+@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "-a b.mp4", "data:日本 1%03d.MP4"])
 @pytest.mark.parametrize("fps", [25, NTSC])
 @pytest.mark.parametrize("size", [(48, 64), (47, 63), (47, 64)])
 def test_size_rate_and_every_frame_come_back(tmp_path, monkeypatch, name, fps, size):
