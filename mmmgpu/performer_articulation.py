@@ -30,7 +30,7 @@ ARTICULATORS = (
     "tongue_advance",
 )
 REST = (0.0, 0.5, 0.0, 0.0, 0.0, 0.35, 0.0, 0.3, 0.4)
-_FADE = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 3.0, 1.5, 1.5])  # closures are brief
+_FADE = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 5.0, 5.0, 1.5, 1.5])  # closures are brief
 _FLOOR = 1e-6  # dominance of silence everywhere, so that the mean is defined
 
 

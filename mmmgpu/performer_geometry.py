@@ -4,7 +4,7 @@ The *neutral* face is painted once. At a frame, the point (x, y) of the head sho
 (u, v), found in two one-dimensional monotone steps, so that both directions are exact:
 
     v = V(x, y)    per column x, a monotone cubic through knots, torn open along the lips
-    u = x + g(v) (m - m') q exp((1 - q^2) / 2),  q = x / m'
+    u = x + g(v) (m - m') q exp((1 - |q|^2.5) / 2.5),  q = x / m'
 
 where m and m' are half the mouth's width at rest and now, and g is 1 about the lips and fades out
 at the nose and the chin. All lengths in face units (see `performer_traits`).
@@ -92,17 +92,18 @@ def squeeze(shape: Shape, p: Pucker, x: Array, v: Array) -> Array:
     """Neutral abscissa u of the points (x, v); strictly increasing in x."""
     q = x / p.half_width
     change = _reach(shape, v) * (shape.mouth_width - p.half_width)
-    return np.asarray(x + change * q * np.exp((1 - q * q) / 2))
+    return np.asarray(x + change * q * np.exp((1 - np.abs(q) ** 2.5) / 2.5))
 
 
 def unsqueeze(shape: Shape, p: Pucker, u: Array, v: Array) -> Array:
     """Inverse of `squeeze` in x, to machine precision (Newton; the slope is never below 0.3)."""
     x = u.astype(np.float64)
     amplitude = _reach(shape, v) * (shape.mouth_width - p.half_width)
-    for _ in range(12):
+    for _ in range(20):
         q = x / p.half_width
-        bump = amplitude * np.exp((1 - q * q) / 2)
-        slope = 1 + bump * (1 - q * q) / p.half_width
+        power = np.abs(q) ** 2.5
+        bump = amplitude * np.exp((1 - power) / 2.5)
+        slope = 1 + bump * (1 - power) / p.half_width
         x = x - (x + bump * q - u) / np.maximum(slope, 0.3)
     return x
 
@@ -110,7 +111,7 @@ def unsqueeze(shape: Shape, p: Pucker, u: Array, v: Array) -> Array:
 def _reach(shape: Shape, v: Array) -> Array:
     """Share g(v) of the mouth's change of width that is felt at height v."""
     d = v - shape.mouth
-    fade = np.where(d < 0, (-d - 0.064) / 0.110, (d - 0.078) / 0.110)
+    fade = np.where(d < 0, (-d - 0.062) / 0.095, (d - 0.078) / 0.105)
     t = np.clip(fade, 0, 1)
     return np.asarray(1 - t * t * (3 - 2 * t))
 

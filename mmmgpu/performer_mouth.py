@@ -111,21 +111,20 @@ def _tongue(
 ) -> Image:
     """A rounded body with a groove, behind the lower teeth unless the tip comes forward."""
     reach = smoothstep(0.6, 1.0, np.asarray(advance, np.float32))
-    top = floor + 0.014 - 0.115 * height - 0.012 * advance
+    top = floor - 0.004 - 0.105 * height - 0.012 * advance
     wide = 0.150 + 0.02 * advance - 0.050 * reach - 0.02 * height
     thick = 0.11 - 0.062 * reach
     q = np.abs(grid.x) / wide
-    rim = (
-        top + thick * (1 - np.sqrt(np.maximum(1 - q**2.4, 0))) + 0.006 * np.exp(-((q / 0.22) ** 2))
-    )
+    rim = top + thick * (1 - np.sqrt(np.maximum(1 - q * q, 0))) + 0.006 * np.exp(-((q / 0.22) ** 2))
     d = (grid.y - rim) / thick
-    cover = smoothstep(-0.05, 0.09, d) * smoothstep(1.02, 0.92, q)
+    cover = smoothstep(-0.05, 0.09, d) * smoothstep(1.0, 0.75, q)
     if reach > 0:
         under = top + 2.2 * thick * np.sqrt(np.maximum(1 - q**2.2, 0))
         cover = cover * (1 - reach * smoothstep(-0.006, 0.006, grid.y - under))
     tilt = np.exp(-(((d - 0.42) / 0.42) ** 2)) * (1 - 0.45 * q * q)
-    lit = (0.30 + 0.70 * tilt) * (0.42 + 0.30 * advance + 0.32 * reach)
+    lit = (0.30 + 0.70 * tilt) * (0.48 + 0.30 * advance + 0.32 * reach)
     lit = lit * (1 - 0.22 * np.exp(-((grid.x / 0.010) ** 2)) * (1 - reach))
+    lit = lit * smoothstep(1.05, 0.45, q)
     flesh = np.array([0.56, 0.215, 0.195], np.float32) * lit[..., None]
     side = 0.05 * np.sign(performer.light.key_direction[0])
     wet = 0.10 * np.exp(-(((grid.x - side) / 0.035) ** 2) - ((d - 0.30) / 0.12) ** 2)

@@ -107,6 +107,7 @@ def _shirt(performer: Performer, grid: Grid, rng: np.random.Generator, below: Im
     )
     alpha = smoothstep(-0.005, 0.005, y - edge)
     contact = blur(alpha, 0.022 * grid.px) * (1 - alpha)
+    contact *= smoothstep(-0.02, 0.01, y - line)  # on the skin, not on the wall
     return over(below * (1 - 0.75 * contact)[..., None], body, alpha)
 
 
