@@ -4,6 +4,7 @@ from fractions import Fraction
 
 import av
 import numpy as np
+from av.stream import Disposition
 
 
 def still(height=48, width=64):
@@ -72,6 +73,23 @@ def encode_sound(path, samples, rate, *, codec="pcm_s16le", sample_format="s16",
             media.mux(stream.encode(sound))
         for open_stream in [stream, *([picture] if frames else [])]:
             media.mux(open_stream.encode(None))
+    return path
+
+
+def song_with_cover(path, samples, rate):
+    """A sound file (n, 1) that carries a cover picture, as music files do."""
+    with av.open(str(path), "w") as media:
+        stream = media.add_stream("aac", rate=rate)
+        stream.layout = "mono"
+        cover = media.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 64, 48, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        block = np.ascontiguousarray(samples.T)
+        sound = av.AudioFrame.from_ndarray(block, format="fltp", layout="mono")
+        sound.sample_rate, sound.pts, sound.time_base = rate, 0, Fraction(1, rate)
+        media.mux(stream.encode(sound) + stream.encode(None))
+        picture = av.VideoFrame.from_ndarray(still(), format="rgb24")
+        media.mux(cover.encode(picture) + cover.encode(None))
     return path
 
 

@@ -3,12 +3,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from media import clicks, encode, encode_sound, grey_levels, tone
+from media import clicks, encode, encode_sound, grey_levels, song_with_cover, tone
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu.errors import InputError
 from mmmgpu.sounds import check_sync, energy, read_sound, read_wav, resample, write_wav
-from mmmgpu.videos import VideoInfo
+from mmmgpu.videos import VideoInfo, probe
 
 
 @pytest.mark.parametrize(
@@ -72,6 +72,13 @@ def test_sample_0_is_the_beginning_of_the_picture(tmp_path, picture, sound):
     )
     samples, _ = read_sound(path)
     assert np.argmax(samples > 0.4) / rate == pytest.approx(0.7 + sound - picture, abs=0.002)
+
+
+def test_a_cover_picture_is_no_video(tmp_path):
+    path = song_with_cover(tmp_path / "a.mp4", tone(1, 16000), 16000)
+    assert len(read_sound(path)[0]) == pytest.approx(16000, abs=1024)
+    with pytest.raises(InputError, match="has no picture"):
+        probe(path)
 
 
 def test_dropouts_become_silence_and_jitter_does_not(tmp_path):
