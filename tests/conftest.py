@@ -1,0 +1,23 @@
+import pytest
+
+from mmmgpu.backends import BACKENDS, get_backend
+
+
+def pytest_addoption(parser):
+    parser.addoption("--backend", action="append", help="a backend to test; default: all of them")
+
+
+def pytest_generate_tests(metafunc):
+    if "backend" in metafunc.fixturenames:
+        chosen = metafunc.config.getoption("--backend") or sorted(set(BACKENDS) - {"numpy"})
+        metafunc.parametrize("backend", chosen, indirect=True, scope="session")
+
+
+@pytest.fixture(scope="session")
+def backend(request):
+    """The name of a backend other than the reference.
+
+    One that was asked for and cannot load is a failure, never a skip.
+    """
+    get_backend(request.param)
+    return request.param

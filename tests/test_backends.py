@@ -1,0 +1,200 @@
+"""Names, devices, threads, damaged caches, and chains that stay on the device."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mmmgpu import backends
+from mmmgpu.backends import BACKENDS, default_threads, get_backend
+from mmmgpu.errors import InputError
+
+EVERYTHING = """
+import hashlib, sys
+import numpy as np
+from mmmgpu import operations as o
+rng = np.random.default_rng(0)
+field = rng.normal(0, 1, (5, 33, 40, 6)).astype(np.float32)
+flow = rng.normal(0, 3, (5, 33, 40, 2)).astype(np.float32)
+backend = sys.argv[1]
+warped, weight = o.forward_warp(field, flow, backend=backend)
+alone, _ = o.forward_warp(field[0], flow[0], backend=backend)
+filled = o.fill_holes(warped, weight, threshold=0.3, backend=backend)
+blended = o.blend(filled, rng.random((3, 5)), backend=backend)
+sampled = o.sample(filled, flow * 9, backend=backend)
+rows = field.reshape(5, -1, 6)
+scanned = o.distance_scan(rows, np.tile(rows, (9, 1, 1)), rng.random(1320), backend=backend)
+results = warped, weight, alone, filled, blended, sampled, scanned
+print(hashlib.sha256(b"".join(r.tobytes() for r in results)).hexdigest())
+"""
+
+
+def run(program, *arguments, **environment):
+    """Standard output of a Python program in a process of its own, which must succeed."""
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def on_device(k, *arrays):
+    return [k.to_device(np.ascontiguousarray(a, np.float32)) for a in arrays]
+
+
+def test_an_unknown_backend_lists_the_known_ones():
+    with pytest.raises(InputError, match=r"'cuda'; choose one of \['numpy', 'opencl', 'warp'\]"):
+        get_backend("cuda")
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_an_unknown_device_is_an_error_that_names_it(name):
+    with pytest.raises(InputError, match=f"{name}.*no.such"):
+        get_backend(f"{name}:no:such")
+
+
+@pytest.mark.parametrize(("name", "explicit"), [("warp", "warp:cpu"), ("opencl", "opencl:0:0")])
+def test_a_device_may_be_named(name, explicit):
+    k = get_backend(explicit)
+    (array,) = on_device(k, np.arange(6).reshape(1, 2, 3))
+    assert_array_equal(k.to_host(array), np.arange(6).reshape(1, 2, 3))
+    assert type(k) is type(get_backend(name))
+
+
+def test_a_library_that_is_missing_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(backends.BACKENDS, "absent", "mmmgpu_no_such_module")
+    with pytest.raises(InputError, match=r"needs 'mmmgpu_no_such_module'.*pip install"):
+        get_backend("absent")
+
+
+@pytest.mark.parametrize("bad", ["0", "-1", "two"])
+def test_a_bad_number_of_threads_in_the_environment_is_an_error(monkeypatch, bad):
+    monkeypatch.setenv("MMMGPU_THREADS", bad)
+    with pytest.raises(InputError, match=f"MMMGPU_THREADS .* got '{bad}'"):
+        default_threads()
+
+
+def test_the_environment_sets_the_threads(monkeypatch):
+    monkeypatch.setenv("MMMGPU_THREADS", "3")
+    assert default_threads() == 3
+    with pytest.raises(InputError, match="threads must be at least 1, got 0"):
+        get_backend("warp", 0)
+
+
+@pytest.mark.parametrize("variable", ["MMMGPU_THREADS", "POCL_MAX_PTHREAD_COUNT"])
+def test_the_same_bits_with_any_number_of_threads(backend, variable):
+    answers = {run(EVERYTHING, backend, **{variable: n}) for n in "1237"}
+    assert len(answers) == 1
+
+
+def test_nothing_but_results_on_standard_output(backend):
+    assert len(run(EVERYTHING, backend).split()) == 1
+
+
+def test_a_chain_of_operations_stays_on_the_device(backend):
+    rng = np.random.default_rng(0)
+    residual, flow, points = rng.normal(0, 2, (3, 6, 20, 30, 2))
+    images, weights = rng.random((6, 20, 30, 3)), rng.random((1, 6))
+
+    def chain(name):
+        k = get_backend(name)
+        r, f, i, w, p = on_device(k, residual, flow, images, weights, points.reshape(6, -1, 2))
+        moved = k.fill_holes(*k.forward_warp(r, f), 0.01)
+        warped = k.fill_holes(*k.forward_warp(i, moved), 0.01)
+        return k.to_host(k.blend(warped, w)), k.to_host(k.sample(warped, p))
+
+    for actual, desired in zip(chain(backend), chain("numpy"), strict=True):
+        assert_allclose(actual, desired, rtol=0, atol=1e-5 * np.abs(desired).max())
+
+
+def test_device_operations_may_be_called_from_many_threads(backend):
+    k = get_backend(backend)
+    field, flow = on_device(
+        k, np.random.default_rng(0).random((3, 16, 16, 4)), np.ones((1, 16, 16, 2))
+    )
+    alone = k.to_host(k.forward_warp(field, flow)[0])
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda _: k.to_host(k.forward_warp(field, flow)[0]), range(32)))
+    for result in results:
+        assert_array_equal(result, alone)
+
+
+def test_a_field_without_holes_is_returned_as_it_is(backend):
+    k = get_backend(backend)
+    field, weight = on_device(k, np.ones((2, 3, 4, 2)), np.ones((2, 3, 4)))
+    assert k.fill_holes(field, weight, 0.5) is field
+
+
+WARP_CACHE = """
+import sys, warp
+warp.config.kernel_cache_dir = sys.argv[2]
+"""
+
+
+@pytest.mark.parametrize("pattern", ["*.o", "*.meta"])
+def test_a_damaged_warp_cache_is_rebuilt(tmp_path, pattern):
+    whole = run(WARP_CACHE + EVERYTHING, "warp", tmp_path)
+    damaged = list(tmp_path.rglob(pattern))
+    assert damaged
+    for path in damaged:
+        path.write_bytes(b"\xff" * 50)
+    assert run(WARP_CACHE + EVERYTHING, "warp", tmp_path) == whole
+
+
+def test_a_damaged_pocl_cache_is_not_read(tmp_path):
+    whole = run(EVERYTHING, "opencl", POCL_CACHE_DIR=str(tmp_path), POCL_KERNEL_CACHE="1")
+    damaged = list(tmp_path.rglob("*.so"))
+    assert damaged
+    for path in damaged:
+        path.write_bytes(b"\xff" * 50)
+    assert run(EVERYTHING, "opencl", POCL_CACHE_DIR=str(tmp_path)) == whole
+
+
+def test_first_use_by_several_processes_at_once(backend, tmp_path):
+    setup = WARP_CACHE if backend == "warp" else ""
+    with ThreadPoolExecutor(3) as pool:
+        answers = set(pool.map(lambda _: run(setup + EVERYTHING, backend, tmp_path), range(3)))
+    assert len(answers) == 1
+
+
+def test_no_kernel_leaves_its_arrays(tmp_path):
+    """Warp checks every index in its debug mode, and aborts."""
+    debug = WARP_CACHE + "warp.config.mode = 'debug'\n"
+    assert run(debug + EVERYTHING, "warp", tmp_path) == run(EVERYTHING, "warp")
+
+
+def test_a_forked_child_has_threads_of_its_own():
+    fork = """
+import os
+get = "import numpy as np; from mmmgpu import operations as o; "
+get += "o.blend(np.ones((3, 64, 64, 3)), np.ones(3), backend='warp')"
+exec(get)
+child = os.fork()
+if child == 0:
+    exec(get)
+    os._exit(5)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert run(fork, MMMGPU_THREADS="2") == "5\n"
+
+
+def test_a_backend_that_cannot_load_fails_the_tests(tmp_path):
+    """A machine without the library must not pass by testing nothing."""
+    for name in ("conftest.py", "test_kernel_twins.py"):
+        (tmp_path / name).write_text((Path(__file__).parent / name).read_text())
+    (tmp_path / "test_one.py").write_text("def test_one(backend):\n    assert backend\n")
+    tests = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_one.py"]
+    done = subprocess.run(
+        [*tests, "--backend", "opencl:9:9"], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert done.returncode == 1
+    assert b"there is no device 'opencl:9:9'" in done.stdout

@@ -1,0 +1,184 @@
+"""Reference against slow loops, and every backend against the reference, on hostile inputs."""
+
+import numpy as np
+import oracles_kernels as oracles
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mmmgpu import operations
+
+SIZES = [(1, 1), (1, 7), (9, 1), (5, 3), (33, 64), (65, 31)]
+LARGE = (576, 720)
+
+
+def grid(height, width):
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    return np.stack([x, y], axis=-1)
+
+
+def tearing(rng, height, width):
+    flow = np.zeros((height, width, 2), np.float32)
+    flow[..., 0] = np.where(grid(height, width)[..., 0] < width / 2, -2.3, 2.6)
+    return flow
+
+
+FLOWS = {
+    "zero": lambda rng, h, w: np.zeros((h, w, 2), np.float32),
+    "constant": lambda rng, h, w: np.full((h, w, 2), [1.25, -0.7], np.float32),
+    "random": lambda rng, h, w: rng.normal(0, 3, (h, w, 2)).astype(np.float32),
+    "converging": lambda rng, h, w: (np.float32([w, h]) / 2.1 - grid(h, w)).astype(np.float32),
+    "tearing": tearing,
+    "leaving": lambda rng, h, w: np.full((h, w, 2), [w - 0.5, 0.5 - h], np.float32),
+    "tiny": lambda rng, h, w: rng.choice(np.float32([1e-30, -1e-30, 1e-9, -1e-9]), (h, w, 2)),
+    "1e6": lambda rng, h, w: rng.choice(np.float32([1e6, -1e6, 0.5]), (h, w, 2)),
+    "1e30": lambda rng, h, w: rng.choice(np.float32([1e30, -1e30, 0.5]), (h, w, 2)),
+}
+
+
+def assert_close(actual, desired):
+    """Within 1e-5 of the desired output's scale."""
+    assert actual.dtype == np.float32
+    scale = np.abs(desired).max(initial=1e-30)
+    assert_allclose(actual, desired, rtol=0, atol=1e-5 * scale)
+
+
+def field_and_flow(flow, size, channels, batch=2):
+    rng = np.random.default_rng(channels)
+    field = rng.normal(0, 1, (batch, *size, channels)).astype(np.float32)
+    return field, np.stack([FLOWS[flow](rng, *size) for _ in range(batch)])
+
+
+def weights_with_holes(rng, size):
+    """Weights of four images: no holes, half holes, one valid pixel in the corner, holes left."""
+    weight = rng.uniform(0.5, 1, (4, *size)).astype(np.float32)
+    weight[1] *= rng.random(size) < 0.5
+    weight[2] = 0
+    weight[3, :, : size[1] // 2] = 0
+    weight[1:, -1, -1] = 1
+    return weight
+
+
+@pytest.mark.parametrize("size", SIZES[:4])
+@pytest.mark.parametrize("flow", FLOWS)
+def test_the_reference_warps_as_the_loops_do(flow, size):
+    field, flows = field_and_flow(flow, size, 2)
+    warped, weight = operations.forward_warp(field, flows, backend="numpy")
+    for b in range(2):
+        desired, desired_weight = oracles.forward_warp(field[b], flows[b])
+        assert_close(weight[b], desired_weight)
+        assert_close(warped[b], desired)
+
+
+@pytest.mark.parametrize("size", [*SIZES[:4], (13, 10)])
+def test_the_reference_fills_as_the_loops_do(size):
+    rng = np.random.default_rng(0)
+    field = rng.normal(0, 1, (4, *size, 2)).astype(np.float32)
+    weight = weights_with_holes(rng, size)
+    filled = operations.fill_holes(field, weight, threshold=0.25, backend="numpy")
+    for b in range(4):
+        assert_close(filled[b], oracles.fill_holes(field[b], weight[b], 0.25))
+
+
+def test_the_reference_blends_samples_and_scans_as_the_loops_do():
+    rng = np.random.default_rng(0)
+    field = rng.normal(0, 1, (3, 5, 4, 2)).astype(np.float32)
+    weights = rng.normal(0, 1, 3)
+    points = rng.uniform(-2, 7, (6, 2)).astype(np.float32)
+    assert_close(operations.blend(field, weights, backend="numpy"), oracles.blend(field, weights))
+    assert_close(
+        operations.sample(field[0], points, backend="numpy"), oracles.sample(field[0], points)
+    )
+    queries, corpus, shares = field[:2].reshape(2, 20, 2), field.reshape(3, 20, 2), rng.random(20)
+    assert_close(
+        operations.distance_scan(queries, corpus, shares, backend="numpy"),
+        oracles.distance_scan(queries, corpus, shares),
+    )
+
+
+@pytest.mark.parametrize("channels", range(1, 9))
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("flow", FLOWS)
+def test_forward_warp(backend, flow, size, channels):
+    field, flows = field_and_flow(flow, size, channels)
+    actual = operations.forward_warp(field, flows, backend=backend)
+    desired = operations.forward_warp(field, flows, backend="numpy")
+    for a, d in zip(actual, desired, strict=True):
+        assert_close(a, d)
+
+
+@pytest.mark.parametrize("flow", ["random", "converging"])
+def test_forward_warp_of_a_large_picture(backend, flow):
+    field, flows = field_and_flow(flow, LARGE, 3, batch=1)
+    actual = operations.forward_warp(field, flows, backend=backend)
+    desired = operations.forward_warp(field, flows, backend="numpy")
+    for a, d in zip(actual, desired, strict=True):
+        assert_close(a, d)
+
+
+@pytest.mark.parametrize(("fields", "flows"), [(1, 5), (5, 1), (5, 5)])
+def test_a_single_field_or_flow_serves_the_whole_batch(backend, fields, flows):
+    field, flow = field_and_flow("random", (8, 9), 3, batch=5)
+    every = np.broadcast_to(field[:fields], field.shape), np.broadcast_to(flow[:flows], flow.shape)
+    actual = operations.forward_warp(field[:fields], flow[:flows], backend=backend)
+    desired = operations.forward_warp(*every, backend="numpy")
+    for a, d in zip(actual, desired, strict=True):
+        assert_close(a, d)
+
+
+@pytest.mark.parametrize("channels", range(1, 9))
+@pytest.mark.parametrize("size", SIZES)
+def test_fill_holes(backend, size, channels):
+    rng = np.random.default_rng(channels)
+    field = rng.normal(0, 1, (4, *size, channels)).astype(np.float32)
+    weight = weights_with_holes(rng, size)
+    actual = operations.fill_holes(field, weight, threshold=0.25, backend=backend)
+    assert_close(actual, operations.fill_holes(field, weight, threshold=0.25, backend="numpy"))
+    assert_array_equal(actual[weight >= 0.25], field[weight >= 0.25])
+
+
+def test_fill_holes_of_a_large_picture(backend):
+    rng = np.random.default_rng(0)
+    field = rng.random((4, *LARGE, 3), dtype=np.float32)
+    weight = weights_with_holes(rng, LARGE)
+    actual = operations.fill_holes(field, weight, threshold=0.25, backend=backend)
+    assert_close(actual, operations.fill_holes(field, weight, threshold=0.25, backend="numpy"))
+
+
+@pytest.mark.parametrize("number", [1, 46])
+@pytest.mark.parametrize("size", [*SIZES, (96, 80)])
+def test_blend(backend, size, number):
+    rng = np.random.default_rng(number)
+    images = rng.normal(0, 1, (number, *size, 3)).astype(np.float32)
+    weights = rng.normal(0, 1, (2, number)) * (rng.random((2, number)) < 0.5)
+    actual = operations.blend(images, weights, backend=backend)
+    assert_close(actual, operations.blend(images, weights, backend="numpy"))
+
+
+@pytest.mark.parametrize("channels", range(1, 9))
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("flow", FLOWS)
+def test_sample(backend, flow, size, channels):
+    field, flows = field_and_flow(flow, size, channels)
+    points = grid(*size) + flows
+    actual = operations.sample(field, points, backend=backend)
+    assert_close(actual, operations.sample(field, points, backend="numpy"))
+
+
+@pytest.mark.parametrize("channels", range(1, 9))
+@pytest.mark.parametrize(("queries", "rows"), [(1, 1), (2, 3), (5, 70)])
+@pytest.mark.parametrize("points", [1, 16, 17, 1000])
+def test_distance_scan(backend, points, queries, rows, channels):
+    rng = np.random.default_rng(points)
+    q = rng.normal(0, 1, (queries, points, channels))
+    c = rng.normal(0, 1, (rows, points, channels))
+    w = rng.random(points)
+    actual = operations.distance_scan(q, c, w, backend=backend)
+    assert_close(actual, operations.distance_scan(q, c, w, backend="numpy"))
+
+
+def test_distance_scan_of_large_equal_residuals(backend):
+    """Adding one number many times is where a float32 sum drifts most."""
+    queries, corpus = np.full((1, 720 * 576, 2), 0.3), np.zeros((2, 720 * 576, 2))
+    weights = np.full(720 * 576, 0.7)
+    actual = operations.distance_scan(queries, corpus, weights, backend=backend)
+    assert_close(actual, operations.distance_scan(queries, corpus, weights, backend="numpy"))

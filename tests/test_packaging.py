@@ -1,0 +1,25 @@
+"""The wheel ships every kernel; the bare name `kernels` is not installed."""
+
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_wheel_has_every_kernel(tmp_path):
+    source = tmp_path / "source"  # a clean copy: setuptools would reuse a stale build/lib
+    for folder in ("kernels", "mmmgpu"):
+        shutil.copytree(ROOT / folder, source / folder)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "-q"]
+    subprocess.run([*pip, "-w", tmp_path, source], check=True, capture_output=True)
+
+    (wheel,) = tmp_path.glob("*.whl")
+    shipped = set(zipfile.ZipFile(wheel).namelist())
+    sources = [f for f in (ROOT / "kernels").iterdir() if f.suffix in {".py", ".cl"}]
+    assert {f"mmmgpu/kernels/{f.name}" for f in sources} <= shipped
+    assert not any(name.startswith("kernels/") for name in shipped)
