@@ -14,7 +14,6 @@ from mmmgpu.performer_shading import Image, noise, smoothstep
 from mmmgpu.performer_traits import Performer, Shape
 
 _IRIS = 0.0405
-_BLINK_DOWN = 0.72  # share of the opening that the upper lid closes
 
 
 @dataclass(frozen=True)
@@ -44,12 +43,12 @@ def lids(shape: Shape, x: Image, blink: float) -> Lids:
     return Lids(
         across.astype(f),
         (up + (closed - up) * blink).astype(f),
-        (low + (closed - low) * blink * 0.6 + (closed - low) * 0.4 * (blink > 0.98)).astype(f),
+        (low + (closed - low) * blink).astype(f),
         closed.astype(f),
     )
 
 
-def lid_map(shape: Shape, edge: Lids, y: Image) -> Image:
+def lid_map(edge: Lids, y: Image) -> Image:
     """Neutral y of the skin shown at y: the upper lid's skin slides, the rest stays."""
     top = -0.105
     span_now = np.maximum(edge.upper - top, 1e-3)

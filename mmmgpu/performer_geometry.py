@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.performer_traits import Field, Performer, Shape
+from mmmgpu.performer_traits import Field, Shape
 
 Array = Field
 _JAW_DROP = 0.125  # of the chin, jaw wide open
@@ -199,7 +199,7 @@ def _monotone(y: Array, knots: Array, values: Array) -> Array:
     return np.asarray(out)
 
 
-def pose_weight(performer: Performer, x: Array, y: Array) -> Array:
+def pose_weight(x: Array, y: Array) -> Array:
     """How much a point follows the head, in [0, 1]: the shoulders stay, so does the wall."""
     neck = np.clip((y - 0.70) / 0.50, 0, 1)
     away = np.clip((np.hypot(x / 1.0, (y + 0.1) / 1.25) - 0.62) / 0.38, 0, 1)
@@ -207,19 +207,19 @@ def pose_weight(performer: Performer, x: Array, y: Array) -> Array:
     return np.asarray(1 - t * t * (3 - 2 * t))
 
 
-def undo_pose(performer: Performer, pose: Array, x: Array, y: Array) -> tuple[Array, Array]:
+def undo_pose(pose: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Head point shown at the picture's point (x, y); `pose` is (dx, dy, roll [rad], log scale)."""
     dx, dy, roll, log_scale = pose
     c, s = np.cos(-roll) * np.exp(-log_scale), np.sin(-roll) * np.exp(-log_scale)
     px, py = x - dx, y - dy - 0.7  # the head turns about the neck
-    w = pose_weight(performer, x, y)
+    w = pose_weight(x, y)
     return x + w * (c * px - s * py - x), y + w * (s * px + c * py + 0.7 - y)
 
 
-def apply_pose(performer: Performer, pose: Array, x: Array, y: Array) -> tuple[Array, Array]:
+def apply_pose(pose: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Inverse of `undo_pose` by fixed-point iteration; the movement is a contraction."""
     qx, qy = x, y
     for _ in range(40):
-        hx, hy = undo_pose(performer, pose, qx, qy)
+        hx, hy = undo_pose(pose, qx, qy)
         qx, qy = qx + x - hx, qy + y - hy
     return qx, qy

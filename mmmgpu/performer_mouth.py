@@ -46,7 +46,7 @@ def paint_inside(
 ) -> Image:
     """Radiance inside the mouth; `tongue` is (height, advance), both in [0, 1]."""
     shape = performer.shape
-    out = _cavity(performer, grid, gap)
+    out = _cavity(grid, gap)
     height, advance = tongue
     dim = min(p.half_width / shape.mouth_width, 1.0) ** 1.2
     teeth_top, teeth_low = upper_teeth_edge(shape), lower_teeth_edge(shape, p)
@@ -56,10 +56,10 @@ def paint_inside(
     if advance >= 0.75:
         out = _tongue(performer, grid, out, teeth_low, height, advance)
     out = _teeth(performer, grid, out, teeth_top, _UPPER, 1, dim)
-    return out * _lip_shadow(performer, grid, gap)[..., None]
+    return out * _lip_shadow(grid, gap)[..., None]
 
 
-def _cavity(performer: Performer, grid: Grid, gap: Opening) -> Image:
+def _cavity(grid: Grid, gap: Opening) -> Image:
     """Deep red-brown, darker towards the middle."""
     t = (grid.y - gap.upper) / np.maximum(gap.lower - gap.upper, 0.01)
     glow = 0.35 + 0.9 * np.clip(np.abs(t - 0.45) - 0.1, 0, 1)
@@ -67,7 +67,7 @@ def _cavity(performer: Performer, grid: Grid, gap: Opening) -> Image:
     return np.asarray(glow[..., None] * deep, np.float32)
 
 
-def _lip_shadow(performer: Performer, grid: Grid, gap: Opening) -> Image:
+def _lip_shadow(grid: Grid, gap: Opening) -> Image:
     """The upper lip's shade on what lies behind it, and darkness towards the corners."""
     below_lip = np.clip((grid.y - gap.upper) / 0.040, 0, 1)
     above_lip = np.clip((gap.lower - grid.y) / 0.016, 0, 1)

@@ -24,7 +24,7 @@ def paint_behind(performer: Performer, grid: Grid, rng: np.random.Generator) -> 
         alpha = _back_hair(performer, grid)
         picture = over(picture, 0.40 * _strands(performer, grid, rng, alpha), alpha)
     picture = _body(performer, grid, rng, picture)
-    return _ears(performer, grid, rng, picture)
+    return _ears(performer, grid, picture)
 
 
 def paint_front(performer: Performer, grid: Grid, rng: np.random.Generator) -> tuple[Image, Image]:
@@ -111,7 +111,7 @@ def _shirt(performer: Performer, grid: Grid, rng: np.random.Generator, below: Im
     return over(below * (1 - 0.75 * contact)[..., None], body, alpha)
 
 
-def _ears(performer: Performer, grid: Grid, rng: np.random.Generator, below: Image) -> Image:
+def _ears(performer: Performer, grid: Grid, below: Image) -> Image:
     if performer.hair.style == "long":
         return below
     top, end = -0.075, performer.shape.nose_base - 0.055
@@ -135,6 +135,9 @@ def _hairline(performer: Performer, x: Image) -> Image:
     hair = performer.hair
     side = np.abs(x) / 0.46
     recess = hair.recess * np.exp(-(((np.abs(x) - 0.25) / 0.09) ** 2))
+    if hair.style in ("long", "tied"):  # parted, so that the forehead shows up to the parting
+        off = np.abs(x - 0.25 * hair.parting) / 0.46
+        return np.asarray(hair.hairline - 0.115 + 0.62 * np.minimum(off, 1.25) ** 2.2)
     return np.asarray(hair.hairline + 0.48 * np.minimum(side, 1.15) ** 4 - recess)
 
 

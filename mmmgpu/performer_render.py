@@ -74,7 +74,7 @@ def portrait(performer: Performer) -> Portrait:
     skin = _shade_face(performer, grid, face, _REST_FOLD)
     picture = over(behind * (1 - shadow)[..., None], skin, face.alpha)
     still = to_bytes(over(picture, front, front_alpha))
-    weight = np.float32(1) * pose_weight(performer, grid.x, grid.y)
+    weight = np.float32(1) * pose_weight(grid.x, grid.y)
     fibres = np.random.default_rng((performer.seed, 8)).normal(size=(8, 120)).astype(np.float32)
     return Portrait(
         grid, face, behind, front, front_alpha, shadow, weight, fibres, still, mouth, eyes
@@ -133,10 +133,21 @@ def paint_frame(performer: Performer, articulation: Articulation, t: int) -> NDA
     """Picture (H, W, 3) of frame `t`, without noise."""
     art = portrait(performer)
     canvas = art.still.copy()
-    values = articulation.at(t)
-    canvas[_inset(art.mouth)] = to_bytes(_paint_lower_face(performer, art, values)[2:-2, 2:-2])
-    _paint_eyes(performer, art, canvas, articulation.blink[t], articulation.gaze[t])
+    repaint(performer, art, canvas, articulation, t)
     return _posed(performer, art, canvas, articulation.pose[t])
+
+
+def repaint(
+    performer: Performer,
+    art: Portrait,
+    canvas: NDArray[np.uint8],
+    articulation: Articulation,
+    t: int,
+) -> None:
+    """Paint what moves at frame `t` into `canvas`, a copy of the still picture."""
+    lower = _paint_lower_face(performer, art, articulation.at(t))
+    canvas[_inset(art.mouth)] = to_bytes(lower[2:-2, 2:-2])
+    _paint_eyes(performer, art, canvas, articulation.blink[t], articulation.gaze[t])
 
 
 def _posed(
@@ -249,7 +260,7 @@ def _paint_eyes(
     """Paint the eyes' window of `canvas`."""
     shape, grid = performer.shape, art.grid.window(*art.eyes)
     edge = lids(shape, grid.x, float(blink))
-    v = lid_map(shape, edge, grid.y)
+    v = lid_map(edge, grid.y)
     cols, rows = _pixels(art.grid, grid.x, v)
     face = _carry_surface(art.face, cols, rows)
     skin = _shade_face(performer, grid, face, _REST_FOLD)
@@ -257,6 +268,7 @@ def _paint_eyes(
     balls = paint_eyeballs(performer, grid, edge, (float(gaze[0]), float(gaze[1])), art.fibres)
     balls = balls * (0.35 + 0.65 * lash_shadow(shape, edge, grid.y, 1.0))[..., None]
     picture = over(skin, balls, opening(edge, grid.y, grid.px))
+    picture = over(picture, art.front[art.eyes], art.front_alpha[art.eyes])
     near = (np.abs(edge.across) < 1.55)[2:-2, 2:-2, None]
     part = _inset(art.eyes)
     canvas[part] = np.where(near, to_bytes(picture[2:-2, 2:-2]), canvas[part])

@@ -64,7 +64,7 @@ class Skin:
 
 @dataclass(frozen=True)
 class Hair:
-    """Hair and clothes: `style` is one of "short", "side", "long", "tied"."""
+    """Hair and clothes: `style` "short", "side", "long" or "tied", `neckline` "crew" or "vee"."""
 
     style: str
     colour: Colour
@@ -180,7 +180,7 @@ def _draw_shape(rng: np.random.Generator, male: float) -> Shape:
         upper_lip=_around(rng, 0.058 - 0.012 * male, 0.007),
         lower_lip=_around(rng, 0.074 - 0.010 * male, 0.008),
         cupid=_around(rng, 0.16, 0.05),
-        seam_curve=_around(rng, -0.007, 0.004),
+        seam_curve=_around(rng, -0.012, 0.004),
         cheek=_around(rng, 1.0, 0.2),
         fold=_around(rng, 0.8 + 0.4 * male, 0.2),
         skull=_around(rng, 0.80, 0.015),
@@ -224,7 +224,7 @@ def _draw_hair(rng: np.random.Generator, male: float, tone: float) -> Hair:
         volume=_around(rng, 0.055 if male > 0.5 else 0.075, 0.01),
         parting=float(rng.choice([-1, 1])) * _around(rng, 0.16, 0.03),
         shirt=shirts[int(rng.integers(len(shirts)))],
-        neckline=str(rng.choice(["crew", "vee", "collar"])),
+        neckline=str(rng.choice(["crew", "vee"])),
         background=walls[int(rng.integers(len(walls)))],
     )
 

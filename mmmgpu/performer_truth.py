@@ -97,7 +97,7 @@ def true_flow(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Flow [px] (H, W, 2) from frame `a` to `b`, and where it is valid (H, W)."""
     px, py = pixel_centres(performer)
-    hx, hy = undo_pose(performer, articulation.pose[a], px, py)
+    hx, hy = undo_pose(articulation.pose[a], px, py)
     seen = _look(performer, _mouth(performer, articulation, a), hx, hy)
     after = _mouth(performer, articulation, b)
     fx, fy = _show(performer.shape, after, seen.u, seen.v, seen.upper)
@@ -108,7 +108,7 @@ def true_flow(
         articulation.gaze[a] != articulation.gaze[b]
     ):
         valid &= ~_about_the_eyes(performer.shape, hx, hy)
-    rx, ry = apply_pose(performer, articulation.pose[b], qx, qy)
+    rx, ry = apply_pose(articulation.pose[b], qx, qy)
     dx, dy = (rx - px) * performer.scale, (ry - py) * performer.scale
     ox, oy = performer.origin
     height, width = performer.size
@@ -128,7 +128,7 @@ def _about_the_eyes(shape: Shape, x: Array, y: Array) -> Mask:
 def true_masks(performer: Performer, articulation: Articulation, t: int) -> dict[str, Mask]:
     """Masks (H, W) of frame `t` by name; see `mmmgpu.performer.masks`."""
     px, py = pixel_centres(performer)
-    hx, hy = undo_pose(performer, articulation.pose[t], px, py)
+    hx, hy = undo_pose(articulation.pose[t], px, py)
     seen = _look(performer, _mouth(performer, articulation, t), hx, hy)
     on_lip = lip_mask(performer.shape, Grid(np.float32(1) * seen.u, np.float32(1) * seen.v, 1.0))
     lips = (on_lip > 0.5) & ~seen.inside
@@ -143,7 +143,7 @@ def true_landmarks(performer: Performer, articulation: Articulation, t: int) -> 
     x, y = _show(shape, p, skin[:, 0], skin[:, 1], upper)
     eyes = _eye_points(shape, float(articulation.blink[t]))
     points = np.insert(np.stack([x, y], axis=1), 75, eyes, axis=0)
-    qx, qy = apply_pose(performer, articulation.pose[t], points[:, 0], points[:, 1])
+    qx, qy = apply_pose(articulation.pose[t], points[:, 0], points[:, 1])
     found = np.stack([qx, qy], axis=1) * performer.scale + performer.origin
     return np.asarray(found, np.float64)
 

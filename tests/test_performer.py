@@ -16,6 +16,7 @@ from mmmgpu.performer import (
     performer,
     render,
 )
+from mmmgpu.performer_render import portrait, repaint
 
 SIZE = (160, 144)
 
@@ -152,7 +153,7 @@ def test_flow_moves_the_landmarks(face):
     assert valid[tuple(np.rint(before[rows, ::-1]).astype(int).T)].all()
     points = before[rows].astype(np.float32)
     carried = cv2.remap(q, points[:, None, 0], points[:, None, 1], cv2.INTER_LINEAR)[:, 0]
-    np.testing.assert_allclose(before[rows] + carried, after[rows], rtol=0, atol=0.05)
+    np.testing.assert_allclose(before[rows] + carried, after[rows], rtol=0, atol=0.1)
 
 
 def test_eyes_are_valid_only_while_they_rest(face):
@@ -255,3 +256,24 @@ def test_lips_are_redder_than_the_skin(seed):
     redness = frame[..., 0] / frame[..., 1]
     skin = m["face"] & ~cv2.dilate(m["mouth"].astype(np.uint8), np.ones((5, 5))).astype(bool)
     assert np.median(redness[m["lips"]]) > 1.05 * np.median(redness[skin])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_painted_again_leaves_no_seam(seed):
+    """The windows painted anew at every frame meet the still picture: at rest they are equal."""
+    someone = performer(seed, size=SIZE)
+    art = portrait(someone)
+    canvas = art.still.copy()
+    rest = posed({})
+    repaint(someone, art, canvas, rest, 0)
+    eyes = np.zeros(canvas.shape[:2], bool)
+    eyes[art.eyes] = True
+    lips = cv2.resize(masks(someone, rest, 0)["mouth"].astype(np.uint8), canvas.shape[1::-1]) > 0
+    change = np.abs(canvas.astype(int) - art.still).max(axis=-1)
+    assert (
+        change[~eyes & ~cv2.dilate(lips.astype(np.uint8), np.ones((9, 9))).astype(bool)].max() < 8
+    )
+    rows, cols = art.eyes
+    edge = [change[rows.start + 2, cols], change[rows.stop - 3, cols]]
+    edge += [change[rows, cols.start + 2], change[rows, cols.stop - 3]]
+    assert max(e.max() for e in edge) < 12
