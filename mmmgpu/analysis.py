@@ -31,9 +31,9 @@ F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 FLOW_RIDGE = 1e-3  # r, as a share of the mean diagonal of the Gram matrix of the flows
-STEP_RIDGE = 2e-3  # the same for a Gauss-Newton step
+STEP_RIDGE = 3e-4  # the same for a Gauss-Newton step
 TEXTURE_RIDGE = 1e-6  # the same for beta: makes the programme strictly convex
-STEPS = 3  # Gauss-Newton steps
+STEPS = 2  # Gauss-Newton steps
 OUTLIER = 0.08  # a pixel that differs by more than this counts less in a step
 WAYPOINTS = 2  # prototypes tried as waypoints of the flow to a frame
 THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are looked for

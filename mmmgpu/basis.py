@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.regions import Region, lip_mask, mouth_mask
+from mmmgpu.regions import Region, cover_mask, lip_mask, mouth_mask
 
 F32 = NDArray[np.float32]
 
@@ -19,7 +19,8 @@ class Basis:
     reference: which prototype is the reference.
     region: where the prototypes lie in the reference frame.
     w_f: lip mask, (h, w) in [0, 1]: where flows are compared.
-    w_t: mouth mask, (h, w) in [0, 1]: where textures are compared, and what is composited.
+    w_t: mouth mask, (h, w) in [0, 1]: where textures are compared.
+    cover: (h, w) in [0, 1]: how much of the model a composite shows.
     """
 
     images: F32
@@ -28,6 +29,7 @@ class Basis:
     region: Region
     w_f: F32
     w_t: F32
+    cover: F32
 
     @property
     def moving(self) -> NDArray[np.int64]:
@@ -42,9 +44,9 @@ class Basis:
 
 
 def make_basis(images: F32, flows: F32, reference: int, region: Region) -> Basis:
-    """A `Basis` whose flows fade to 0 where the mouth mask does: outside, the head is rigid."""
-    w_t = mouth_mask(region)
-    window = np.minimum(1, 2 * w_t)[..., None]
-    still = flows * window
+    """A `Basis` whose flows fade to 0 where its cover does: outside, the head is rigid."""
+    cover = cover_mask(region)
+    still = flows * np.minimum(1, 2 * cover)[..., None]
     still[reference] = 0
-    return Basis(images, still.astype(np.float32), reference, region, lip_mask(region), w_t)
+    w_f, w_t = lip_mask(region), mouth_mask(region)
+    return Basis(images, still.astype(np.float32), reference, region, w_f, w_t, cover)

@@ -5,6 +5,7 @@ flow fails where two pictures differ much; a path through pictures that resemble
 not.
 """
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -23,10 +24,12 @@ def matcher(name: str = "dis") -> Matcher:
 
     name: ``"dis"`` (dense inverse search, Kroeger et al. 2016), ``"farneback"`` or ``"tvl1"``.
     """
-    algorithm = _ALGORITHMS[name]()
+    own = threading.local()  # OpenCV's algorithms keep buffers: every thread needs its own
 
     def flow(a: F32, b: F32) -> F32:
-        found: F32 = algorithm.calc(_gray(a), _gray(b), None)
+        if not hasattr(own, "algorithm"):
+            own.algorithm = _ALGORITHMS[name]()
+        found: F32 = own.algorithm.calc(_gray(a), _gray(b), None)
         return found
 
     return flow

@@ -74,14 +74,22 @@ def region_from_box(box: tuple[int, int, int, int], frame_size: tuple[int, int])
     return Region(box, (x + w / 2, y + share * h, width))
 
 
-def mouth_mask(region: Region) -> F32:
-    """w_t, shape (h, w): 1 on mouth, chin and what moves with them, soft towards the edge."""
+def cover_mask(region: Region) -> F32:
+    """Shape (h, w): 1 on mouth, chin and all that moves with them, soft towards the edge.
+
+    This much of the model is seen in a composite; the background's own mouth must not peep out.
+    """
     return _soft(region, HALF_WIDTH, ABOVE, BELOW, FEATHER)
 
 
 def lip_mask(region: Region) -> F32:
     """w_f, shape (h, w): 1 on the lips, soft over the skin that they pull."""
     return _soft(region, 0.80, 0.48, 0.80, 0.34)
+
+
+def mouth_mask(region: Region) -> F32:
+    """w_t, shape (h, w): 1 on lips, teeth and tongue, soft over the skin around them."""
+    return _soft(region, 0.85, 0.50, 0.75, 0.30)
 
 
 def _soft(region: Region, across: float, above: float, below: float, feather: float) -> F32:

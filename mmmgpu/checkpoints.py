@@ -1,0 +1,50 @@
+"""A folder of finished steps beside a result that takes long, so that a killed job continues.
+
+Every step is one ``.npz`` written whole or not at all. The folder belongs to one set of inputs and
+options, told by a fingerprint; steps of others are thrown away.
+"""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.files import atomic_path, require_folder, write_text
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def fingerprint(files: Sequence[Path], options: Mapping[str, Any]) -> str:
+    """Hash of the names, sizes and times of `files` and of `options` (JSON values)."""
+    stats = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+    return hashlib.sha256(json.dumps([stats, dict(options)]).encode()).hexdigest()
+
+
+def open_checkpoints(folder: Path, mark: str) -> Path:
+    """`folder`, holding only steps made under the fingerprint `mark`."""
+    name = folder / "fingerprint"
+    if folder.exists() and (not name.is_file() or name.read_text() != mark):
+        shutil.rmtree(folder)
+    require_folder(folder)
+    write_text(name, mark)
+    return folder
+
+
+def read_step(folder: Path, name: str) -> dict[str, NDArray[Any]] | None:
+    """The arrays of a finished step; None if it has yet to be done."""
+    path = folder / f"{name}.npz"
+    if not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def write_step(folder: Path, name: str, arrays: Arrays) -> None:
+    """Keep the arrays of a finished step."""
+    with atomic_path(folder / f"{name}.npz") as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays)

@@ -1,0 +1,58 @@
+"""The clips of one person with what is said in them, checked before any long work begins."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mmmgpu.alignments import (
+    Alignment,
+    check_against,
+    find_alignment,
+    frame_labels,
+    read_alignment,
+    shift,
+)
+from mmmgpu.errors import InputError
+from mmmgpu.videos import VideoInfo, probe
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One clip of a corpus and its alignment, already moved by ``--sync``."""
+
+    path: Path
+    info: VideoInfo
+    alignment: Alignment
+
+    @property
+    def labels(self) -> list[str]:
+        """The majority phone of every frame."""
+        return frame_labels(self.alignment, self.info.frames, float(self.info.fps))
+
+
+def open_corpus(paths: Sequence[Path], alignments: Path, *, sync: float = 0.0) -> list[Clip]:
+    """Look at every clip and its alignment.
+
+    Args:
+        paths: Video files of one person, with different names.
+        alignments: Folder with a TextGrid, .align or .lab for every clip, or one such file.
+        sync: [s] by which sound and alignment are moved against the picture; negative: earlier.
+
+    Raises:
+        InputError: Of the first file that cannot be used.
+    """
+    if not paths:
+        raise InputError("no clip given; name at least one video file")
+    names = [path.name for path in paths]
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise InputError(f"{double[0]}: two clips have this name; rename one of them")
+    return [_open_clip(path, alignments, sync) for path in paths]
+
+
+def _open_clip(path: Path, alignments: Path, sync: float) -> Clip:
+    info = probe(path, minimum_frames=2)
+    found = find_alignment(alignments, path)
+    alignment = read_alignment(found)
+    check_against(alignment, info.duration, found)
+    return Clip(path, info, shift(alignment, sync) if sync else alignment)

@@ -1,0 +1,223 @@
+"""Models on disk: one safetensors file, checked before it is used. No pickle anywhere.
+
+Tensors are flat and named after the fields of `Model`; what is no array lies as JSON in the header
+beside ``format`` and ``version``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.basis import Basis
+from mmmgpu.errors import InputError
+from mmmgpu.files import atomic_path
+from mmmgpu.models import Calm, Model
+from mmmgpu.phonemes import PhonemeModels
+from mmmgpu.regions import Region
+from mmmgpu.registration import Head
+from mmmgpu.tracks import Reference, Track
+from mmmgpu.trajectory_training import Constants, History, TrainedStream
+
+Tensors = dict[str, NDArray[Any]]
+
+FORMAT = "mmmgpu-model"
+VERSION = 1
+
+
+def save_model(model: Model, path: str | os.PathLike[str]) -> None:
+    """Write `model` to `path`, whole or not at all."""
+    from safetensors.numpy import save_file
+
+    header = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "model": json.dumps(_facts(model), ensure_ascii=False, allow_nan=False),
+    }
+    tensors = {name: np.ascontiguousarray(value) for name, value in _tensors(model).items()}
+    with atomic_path(path) as temporary:
+        save_file(tensors, str(temporary), metadata=header)
+
+
+def load(path: str | os.PathLike[str]) -> Model:
+    """Read the model at `path`.
+
+    Raises:
+        InputError: No such file, not a model, truncated, of a newer version, or with tensors that
+            are missing, misshapen or not finite.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such model file; train one with: mmmgpu train")
+    try:
+        with safe_open(str(path), framework="numpy") as file:
+            header = file.metadata() or {}
+            _check_header(path, header)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as e:
+        if isinstance(e, InputError):
+            raise
+        raise InputError(f"{path}: truncated, damaged or not a model ({e}); train it again") from e
+    try:
+        facts = json.loads(header["model"])
+        _check_tensors(path, tensors, facts)
+        return _assemble(tensors, facts)
+    except (KeyError, TypeError, IndexError, json.JSONDecodeError) as e:
+        raise InputError(f"{path}: the model lacks or misstates {e}; train it again") from e
+
+
+def _check_header(path: Path, header: dict[str, str]) -> None:
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: not a mmmgpu model; give a file that mmmgpu train has written")
+    version = header.get("version", "")
+    if not version.isdecimal() or int(version) > VERSION:
+        raise InputError(
+            f"{path}: has format version {version!r}, this mmmgpu reads up to {VERSION}; "
+            "update mmmgpu"
+        )
+
+
+def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
+    """Every tensor has the shape and type that the others imply, and is finite."""
+    frames, calm = len(tensors["calm.poses"]), tensors["calm.data"].size
+    m, (h, w) = len(facts["sources"]), facts["region"]["box"][:1:-1]
+    points = len(tensors["reference.colours"])
+    patch = tensors["head.patch"].shape
+    wanted: dict[str, tuple[tuple[int, ...], str]] = {
+        "images": ((m, h, w, 3), "f4"),
+        "flows": ((m, h, w, 2), "f4"),
+        **dict.fromkeys(("w_f", "w_t", "cover"), ((h, w), "f4")),
+        "head.patch": (patch, "u1"),
+        "head.mask": (patch, "f4"),
+        "head.to_frame": ((3, 3), "f8"),
+        "reference.colours": ((points, 3), "f4"),
+        "reference.colour_points": ((points, 2), "f8"),
+        "prototype_frames": ((m, facts["frame_size"][1], facts["frame_size"][0], 3), "u1"),
+        "calm.data": ((calm,), "u1"),
+        "calm.poses": ((frames, 3, 3), "f8"),
+        "calm.registered": ((frames,), "b1"),
+        "calm.correlation": ((frames,), "f8"),
+        "calm.gain": ((3,), "f8"),
+        "calm.offset": ((3,), "f8"),
+    }
+    for name, d in (("alpha", m - 1), ("beta", m)):
+        phones = len(facts[name]["labels"])
+        wanted |= {
+            f"{name}.{kind}.{part}": ((phones, d), "f8")
+            for kind in ("pooled", "trained")
+            for part in ("mean", "variance")
+        }
+        wanted[f"{name}.count"] = ((phones,), "i8")
+        wanted[f"{name}.smoothness"] = ((d,), "f8")
+        wanted[f"{name}.training"] = ((len(tensors[f"{name}.training"]), d), "f8")
+        wanted[f"{name}.validation"] = (tensors[f"{name}.validation"].shape, "f8")
+    for name, (shape, kind) in wanted.items():
+        tensor = tensors[name]
+        if tensor.shape != shape or tensor.dtype != np.dtype(kind):
+            raise InputError(
+                f"{path}: tensor {name} must be {np.dtype(kind)} {shape}, "
+                f"is {tensor.dtype} {tensor.shape}; train the model again"
+            )
+        if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
+            raise InputError(f"{path}: tensor {name} holds NaN or infinity; train the model again")
+    if not 0 <= facts["reference"] < m or m < 2 or frames < 1:
+        raise InputError(f"{path}: the model has no valid reference or background; train it again")
+
+
+def _facts(model: Model) -> dict[str, Any]:
+    return {
+        "reference": model.basis.reference,
+        "region": {"box": model.basis.region.box, "mouth": model.basis.region.mouth},
+        "frame_size": model.frame_size,
+        "fps": [model.fps.numerator, model.fps.denominator],
+        "sources": [list(source) for source in model.sources],
+        "calm": {"suffix": model.calm.suffix, "residual": model.calm.track.residual},
+        "alpha": _stream_facts(model.alpha),
+        "beta": _stream_facts(model.beta),
+        "notes": model.notes,
+    }
+
+
+def _stream_facts(stream: TrainedStream) -> dict[str, Any]:
+    return {"labels": list(stream.trained.labels), "constants": vars(stream.constants)}
+
+
+def _tensors(model: Model) -> Tensors:
+    basis, head, calm = model.basis, model.reference.head, model.calm
+    tensors: Tensors = {
+        "images": basis.images,
+        "flows": basis.flows,
+        "w_f": basis.w_f,
+        "w_t": basis.w_t,
+        "cover": basis.cover,
+        "head.patch": head.patch,
+        "head.mask": head.mask,
+        "head.to_frame": head.to_frame,
+        "reference.colours": model.reference.colours,
+        "reference.colour_points": model.reference.colour_points,
+        "prototype_frames": model.prototype_frames,
+        "calm.data": calm.data,
+        "calm.poses": calm.track.poses,
+        "calm.registered": calm.track.registered,
+        "calm.correlation": calm.track.correlation,
+        "calm.gain": calm.track.gain,
+        "calm.offset": calm.track.offset,
+    }
+    for name, stream in (("alpha", model.alpha), ("beta", model.beta)):
+        for kind, models in (("pooled", stream.pooled), ("trained", stream.trained)):
+            tensors[f"{name}.{kind}.mean"] = models.mean
+            tensors[f"{name}.{kind}.variance"] = models.variance
+        tensors[f"{name}.count"] = stream.trained.count
+        tensors[f"{name}.smoothness"] = stream.smoothness
+        tensors[f"{name}.training"] = stream.history.training
+        tensors[f"{name}.validation"] = stream.validation
+    return tensors
+
+
+def _assemble(t: Tensors, facts: dict[str, Any]) -> Model:
+    x, y, w, h = facts["region"]["box"]
+    mouth_x, mouth_y, mouth_width = facts["region"]["mouth"]
+    region = Region((x, y, w, h), (mouth_x, mouth_y, mouth_width))
+    basis = Basis(
+        t["images"], t["flows"], facts["reference"], region, t["w_f"], t["w_t"], t["cover"]
+    )
+    head = Head(t["head.patch"], t["head.mask"], t["head.to_frame"])
+    track = Track(
+        *(t[f"calm.{n}"] for n in ("poses", "registered", "correlation", "gain", "offset")),
+        residual=facts["calm"]["residual"],
+    )
+    return Model(
+        basis=basis,
+        reference=Reference(head, t["reference.colours"], t["reference.colour_points"], region),
+        alpha=_stream("alpha", t, facts),
+        beta=_stream("beta", t, facts),
+        fps=Fraction(*facts["fps"]),
+        prototype_frames=t["prototype_frames"],
+        sources=tuple((str(clip), int(frame)) for clip, frame in facts["sources"]),
+        calm=Calm(t["calm.data"], facts["calm"]["suffix"], track),
+        notes=facts["notes"],
+    )
+
+
+def _stream(name: str, t: Tensors, facts: dict[str, Any]) -> TrainedStream:
+    labels, count = tuple(facts[name]["labels"]), t[f"{name}.count"]
+    pooled, trained = (
+        PhonemeModels(labels, t[f"{name}.{kind}.mean"], t[f"{name}.{kind}.variance"], count)
+        for kind in ("pooled", "trained")
+    )
+    return TrainedStream(
+        pooled,
+        trained,
+        t[f"{name}.smoothness"],
+        Constants(**facts[name]["constants"]),
+        History(t[f"{name}.training"]),
+        t[f"{name}.validation"],
+    )

@@ -1,0 +1,146 @@
+"""The reference of a corpus: where the mouth is, and the head that every clip is registered to."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import islice
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.corpora import Clip
+from mmmgpu.errors import InputError
+from mmmgpu.regions import (
+    Region,
+    locate_mouth,
+    refine_centre,
+    region_around,
+    region_from_box,
+    shrink,
+    speech_motion,
+)
+from mmmgpu.registration import Head, head_from_frame, project, register, to_gray
+from mmmgpu.sounds import energy, read_sound
+from mmmgpu.tracks import Reference, Track, frame_at, make_reference
+from mmmgpu.videos import read_frames
+
+Floats = NDArray[np.float64]
+
+SEARCH_CLIPS = 6  # clips in which the mouth is looked for
+SEARCH_FRAMES = 150  # frames of each
+REFINED_WIDTH = 32  # [px] width of the mouth in the stabilised pictures of the second look
+
+
+def find_reference(
+    corpus: Sequence[Clip], box: tuple[int, int, int, int] | None, *, sync: float = 0.0
+) -> Reference:
+    """A provisional reference: the first frame of the middle clip and the mouth found around it.
+
+    box: the region (x, y, width, height) [px] in that frame, where a person gave it.
+
+    Raises:
+        InputError: Nothing moves with the sound, or there is no sound; `box` leaves the frame.
+    """
+    middle = corpus[len(corpus) // 2]
+    frame = frame_at(middle.path, 0)
+    size = (middle.info.width, middle.info.height)
+    if box is not None:
+        region = region_from_box(box, size)
+    else:
+        region = region_around(_find_mouth(corpus, frame, sync), size)
+    return make_reference(frame, head_from_frame(frame, np.array(region.mouth)), region)
+
+
+def _find_mouth(
+    corpus: Sequence[Clip], frame: NDArray[np.uint8], sync: float
+) -> tuple[float, float, float]:
+    """(x, y, width) [px] in `frame`: first in the raw picture, then in the stabilised one."""
+    some = [corpus[i] for i in _spread(len(corpus), SEARCH_CLIPS)]
+    total = np.zeros(0)
+    scale = 1.0
+    for clip in some:
+        small, scale = shrink(islice(read_frames(clip.path), SEARCH_FRAMES))
+        motion = speech_motion(small, _energy(clip, len(small), sync))
+        total = motion if not total.size else total + _fit(motion, total.shape)
+    x, y, width = (value / scale for value in locate_mouth(total))
+    head = head_from_frame(frame, np.array([x, y, width]))
+    x, y = _second_look(some, head, np.array([x, y, width]), sync)
+    return x, y, width
+
+
+def _spread(n: int, most: int) -> list[int]:
+    """At most `most` of n numbers, evenly spread."""
+    return sorted({round(i * (n - 1) / max(1, most - 1)) for i in range(most)})
+
+
+def _fit(motion: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    return np.asarray(cv2.resize(motion, (shape[1], shape[0]), interpolation=cv2.INTER_AREA))
+
+
+def _energy(clip: Clip, frames: int, sync: float) -> Floats:
+    samples, rate = read_sound(clip.path)
+    late = round(sync * rate)
+    moved = np.pad(samples, (late, 0)) if late > 0 else samples[-late:]
+    return energy(moved, rate, frames, float(clip.info.fps))
+
+
+def _second_look(
+    clips: Sequence[Clip], head: Head, mouth: Floats, sync: float
+) -> tuple[float, float]:
+    """The centre of the mouth [px], looked for around `mouth` in pictures without head motion."""
+    x, y, width = mouth
+    unit = width / REFINED_WIDTH
+    side = 4 * REFINED_WIDTH
+    to_frame = np.array([[unit, 0, x - 2 * width], [0, unit, y - 2 * width], [0, 0, 1]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    total, seen = np.zeros((side, side), np.float32), np.ones((side, side), np.float32)
+    for clip in clips:
+        pictures = []
+        frames = list(islice(read_frames(clip.path), SEARCH_FRAMES))
+        for frame, (pose, _) in zip(frames, register(frames, head), strict=True):
+            gray = to_gray(frame)
+            matrix = pose @ to_frame
+            pictures.append(cv2.warpPerspective(gray, matrix, (side, side), flags=flags))
+            inside = cv2.warpPerspective(np.ones_like(gray), matrix, (side, side), flags=flags)
+            seen = np.minimum(seen, inside)
+        total += speech_motion(pictures, _energy(clip, len(pictures), sync))
+    total *= cv2.erode(seen, np.ones((9, 9)))  # the edge of the picture moves with the head
+    u, v = refine_centre(total, REFINED_WIDTH)
+    carried = project(to_frame, np.array([[u, v]]))[0]
+    return float(carried[0]), float(carried[1])
+
+
+def rebase_reference(
+    reference: Reference, track: Track, t: int, size: tuple[int, int], *, keep_box: bool
+) -> Reference:
+    """`reference` in the pixels and colours of frame `t` of `track`: its pose becomes the identity.
+
+    size: (width, height) [px] of the frame. keep_box: move the box as it is, it was given.
+    """
+    pose, old = track.poses[t], reference.region
+    x, y, width = old.mouth
+    ends = project(pose, np.array([[x, y], [x - width / 2, y], [x + width / 2, y]]))
+    scale = float(np.hypot(*(ends[2] - ends[1]))) / width
+    mouth = (float(ends[0, 0]), float(ends[0, 1]), width * scale)
+    region = region_around(mouth, size)
+    if keep_box:
+        left = round(min(max(old.box[0] + mouth[0] - x, 0), size[0] - old.box[2]))
+        top = round(min(max(old.box[1] + mouth[1] - y, 0), size[1] - old.box[3]))
+        region = Region((left, top, *old.box[2:]), mouth)
+    head = replace(reference.head, to_frame=pose @ reference.head.to_frame)
+    colours = ((reference.colours - track.offset) / track.gain).astype(np.float32)
+    return Reference(head, colours, project(pose, reference.colour_points), region)
+
+
+def check_sound(corpus: Sequence[Clip]) -> None:
+    """Every clip has sound.
+
+    Raises:
+        InputError: Of the first clip without.
+    """
+    for clip in corpus:
+        if not clip.info.has_sound:
+            raise InputError(
+                f"{clip.path}: has no sound, so the mouth cannot be found; "
+                "give --region X,Y,W,H or clips with sound"
+            )

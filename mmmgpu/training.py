@@ -1,0 +1,337 @@
+"""Training: from clips and their alignments to a model (EGP02, DESIGN 5), streaming and resumable.
+
+The steps: find the mouth, track every clip, choose prototypes, compute their flows, analyse every
+frame, train the phoneme models. What each step finds for a clip is kept in a folder beside the
+result until the job is done; in memory stay the PCA and model coordinates of the frames.
+"""
+
+import os
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.analysis import analyze, prepare_analysis, thumbnail
+from mmmgpu.backends import default_threads, get_backend
+from mmmgpu.basis import Basis, make_basis
+from mmmgpu.checkpoints import fingerprint, open_checkpoints, read_step, write_step
+from mmmgpu.corpora import Clip, open_corpus
+from mmmgpu.errors import InputError
+from mmmgpu.flows import best_flow, concatenate, matcher, path_to, shortest_paths
+from mmmgpu.models import Calm, Model
+from mmmgpu.parallel import Cancelled, CancelledError, map_ordered, one_thread_each
+from mmmgpu.phonemes import Utterance
+from mmmgpu.phones import SIL
+from mmmgpu.progress import progress, progress_bar
+from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordinates
+from mmmgpu.references import check_sound, find_reference, rebase_reference
+from mmmgpu.regions import mouth_mask
+from mmmgpu.tracks import Reference, Track, crop_at, crops, frame_at, rebase, track_clip
+from mmmgpu.trajectory_training import TrainedStream, fit_stream
+
+Floats = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a person may choose about training.
+
+    prototypes: M.
+    region: (x, y, width, height) [px] of the mouth region in the first frame of the middle clip;
+        None finds it.
+    sync: [s] by which sound and alignments are moved against the picture; negative: earlier.
+    flow: one of `flows.MATCHERS`.
+    seed: of k-means and of the folds.
+    """
+
+    prototypes: int = 46
+    region: tuple[int, int, int, int] | None = None
+    sync: float = 0.0
+    flow: str = "dis"
+    seed: int = 0
+
+
+DEFAULTS = Options()
+
+
+def train(
+    clips: Sequence[str | os.PathLike[str]],
+    alignments: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    options: Options = DEFAULTS,
+    backend: str = "warp",
+) -> Model:
+    """Learn a person from `clips` and write the model to `out`.
+
+    Args:
+        clips: Video files of one person.
+        alignments: Folder of TextGrid, .align or .lab files named like the clips, or one file.
+        out: The model file; beside it ``out.work`` keeps finished steps until the job is done, and
+            the same call continues after them.
+        options: See `Options`.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Raises:
+        InputError: A clip or alignment cannot be used; the head is found in no clip.
+    """
+    out = Path(out)
+    corpus = open_corpus([Path(c) for c in clips], Path(alignments), sync=options.sync)
+    if options.region is None:
+        check_sound(corpus)
+    folder = _work_folder(out, corpus, options)
+    with one_thread_each():
+        model = _Training(corpus, options, backend, folder).run()
+    model.save(out)
+    shutil.rmtree(folder)
+    return model
+
+
+def _work_folder(out: Path, corpus: Sequence[Clip], options: Options) -> Path:
+    said = [[list(phone) for phone in clip.alignment.phones] for clip in corpus]
+    given = {"options": vars(options), "said": said, "steps": 1}
+    mark = fingerprint([clip.path for clip in corpus], given)
+    return open_checkpoints(out.with_name(out.name + ".work"), mark)
+
+
+@dataclass(frozen=True)
+class _Training:
+    """One run over a corpus; every method is a step of the module docstring."""
+
+    corpus: list[Clip]
+    options: Options
+    backend: str
+    folder: Path
+
+    def run(self) -> Model:
+        provisional = find_reference(self.corpus, self.options.region, sync=self.options.sync)
+        tracks, skipped = self._track(provisional)
+        used = [clip for clip in self.corpus if clip.path.name in tracks]
+        frames = _Frames(used, tracks)
+        chosen, reference_frame, coordinates = self._choose(frames)
+        clip, t = frames.find(reference_frame)
+        size = (clip.info.width, clip.info.height)
+        first = tracks[clip.path.name]
+        kept = self.options.region is not None
+        reference = rebase_reference(provisional, first, t, size, keep_box=kept)
+        rebased = {
+            name: rebase(track, first.poses[t], first.gain, first.offset)
+            for name, track in tracks.items()
+        }
+        frames = _Frames(used, rebased)
+        basis = self._basis(frames, reference, chosen, reference_frame, coordinates)
+        alphas, betas = self._analyse(frames, basis)
+        alpha, beta = self._phonemes(frames, alphas), self._phonemes(frames, betas)
+        places = [frames.find(int(i)) for i in chosen]
+        calm = _calmest(used, rebased, reference)
+        return Model(
+            basis=basis,
+            reference=reference,
+            alpha=alpha,
+            beta=beta,
+            fps=used[0].info.fps,
+            prototype_frames=np.stack([frame_at(c.path, f) for c, f in places]),
+            sources=tuple((c.path.name, f) for c, f in places),
+            calm=Calm(np.fromfile(calm.path, np.uint8), calm.path.suffix, rebased[calm.path.name]),
+            notes=_notes(frames, skipped, self.options),
+        )
+
+    def _track(self, reference: Reference) -> tuple[dict[str, Track], dict[str, str]]:
+        """Tracks by clip name, and why other clips were skipped; thumbnails are left on disk."""
+        mask = mouth_mask(reference.region)
+
+        def one(clip: Clip, cancelled: Cancelled) -> dict[str, NDArray[Any]]:
+            known = read_step(self.folder, f"track-{clip.path.name}")
+            if known is None:
+                known = _track_and_shrink(clip, reference, mask, cancelled)
+                write_step(self.folder, f"track-{clip.path.name}", known)
+            return known
+
+        tracks, skipped = {}, {}
+        found = map_ordered(one, self.corpus, threads=default_threads())
+        for clip, arrays in zip(
+            self.corpus, progress(found, "track clips", total=len(self.corpus)), strict=True
+        ):
+            name = clip.path.name
+            if "skipped" in arrays:
+                skipped[name] = str(arrays["skipped"])
+                print(f"warning: skipped: {skipped[name]}", file=sys.stderr)
+            else:
+                fields = ("poses", "registered", "correlation", "gain", "offset")
+                tracks[name] = Track(*(arrays[f] for f in fields), float(arrays["residual"]))
+        if not tracks:
+            raise InputError(next(iter(skipped.values())))
+        return tracks, skipped
+
+    def _choose(self, frames: "_Frames") -> tuple[NDArray[np.int64], int, F32]:
+        """Prototype frames, the reference among them, and the PCA coordinates of all frames."""
+        coordinates = principal_coordinates(_Thumbnails(self.folder, frames.clips))
+        usable = np.flatnonzero(frames.registered)
+        chosen = choose_prototypes(
+            coordinates[usable], self.options.prototypes, seed=self.options.seed
+        )
+        silent = np.array([label == SIL for clip in frames.clips for label in clip.labels])
+        neutral = most_neutral(coordinates[usable], chosen, silent[usable])
+        return usable[chosen], int(usable[chosen[neutral]]), coordinates
+
+    def _basis(
+        self,
+        frames: "_Frames",
+        reference: Reference,
+        chosen: NDArray[np.int64],
+        reference_frame: int,
+        coordinates: F32,
+    ) -> Basis:
+        """Prototypes with their flows: direct, or along the path of similar frames."""
+        region = reference.region
+        images = {int(i): frames.crop(int(i), region) for i in chosen}
+        mask, match = mouth_mask(region), matcher(self.options.flow)
+        before = shortest_paths(coordinates, reference_frame)
+        origin = images[reference_frame]
+        flows = []
+        for i in progress(chosen, "prototype flows"):
+            path = path_to(int(i), before)
+            via = [frames.walk(path[:-1], region, match)] if len(path) > 2 else []
+            flows.append(best_flow(origin, images[int(i)], mask, via, match))
+        stacked = np.stack([images[int(i)] for i in chosen])
+        place = int(np.flatnonzero(chosen == reference_frame)[0])
+        return make_basis(stacked, np.stack(flows), place, region)
+
+    def _analyse(self, frames: "_Frames", basis: Basis) -> tuple[list[Floats], list[Floats]]:
+        """alpha (T, M - 1) and beta (T, M) of every clip."""
+        analyzer = prepare_analysis(basis, flow=self.options.flow)
+        kernels = get_backend(self.backend, 1)
+        total = sum(clip.info.frames for clip in frames.clips)
+        with progress_bar(total, "analyse frames") as advance:
+
+            def one(clip: Clip, cancelled: Cancelled) -> dict[str, NDArray[Any]]:
+                known = read_step(self.folder, f"analysis-{clip.path.name}")
+                if known is None:
+                    alpha, beta = [], []
+                    for image in crops(clip.path, frames.tracks[clip.path.name], basis.region):
+                        if cancelled():
+                            raise CancelledError
+                        a, b = analyze(analyzer, image, kernels)
+                        alpha.append(a)
+                        beta.append(b)
+                        advance(1)
+                    known = {
+                        "alpha": np.array(alpha, np.float32),
+                        "beta": np.array(beta, np.float32),
+                    }
+                    write_step(self.folder, f"analysis-{clip.path.name}", known)
+                else:
+                    advance(clip.info.frames)
+                return known
+
+            done = list(map_ordered(one, frames.clips, threads=default_threads()))
+        return [d["alpha"] for d in done], [d["beta"] for d in done]
+
+    def _phonemes(self, frames: "_Frames", coordinates: list[Floats]) -> TrainedStream:
+        """The phoneme models of one stream."""
+        utterances = [
+            Utterance(
+                z[good].astype(np.float64),
+                [label for label, g in zip(clip.labels, good, strict=True) if g],
+            )
+            for clip, z in zip(frames.clips, coordinates, strict=True)
+            for good in [frames.tracks[clip.path.name].registered]
+        ]
+        rng = np.random.default_rng(self.options.seed)
+        return fit_stream(utterances, rng=rng)
+
+
+def _track_and_shrink(
+    clip: Clip, reference: Reference, mask: F32, cancelled: Cancelled
+) -> dict[str, NDArray[Any]]:
+    """The track of a clip and a thumbnail of every frame; or why the clip must be left out."""
+    try:
+        track = track_clip(clip.path, reference)
+    except InputError as e:
+        return {"skipped": np.array(str(e))}
+    small = []
+    for image in crops(clip.path, track, reference.region):
+        if cancelled():
+            raise CancelledError
+        small.append(np.round(thumbnail(image, mask) * 255).astype(np.uint8))
+    return {**vars(track), "residual": np.array(track.residual), "thumbnails": np.array(small)}
+
+
+@dataclass(frozen=True)
+class _Thumbnails(Sequence[NDArray[np.uint8]]):
+    """The thumbnails of all clips, read from the work folder one clip at a time."""
+
+    folder: Path
+    clips: Sequence[Clip]
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, i: Any) -> Any:
+        step = read_step(self.folder, f"track-{self.clips[i].path.name}")
+        assert step is not None
+        return step["thumbnails"]
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The frames of all used clips as one numbered row."""
+
+    clips: Sequence[Clip]
+    tracks: Mapping[str, Track]
+
+    @property
+    def registered(self) -> NDArray[np.bool_]:
+        return np.concatenate([self.tracks[c.path.name].registered for c in self.clips])
+
+    def find(self, i: int) -> tuple[Clip, int]:
+        """The clip and its frame that are number `i` of the row."""
+        for clip in self.clips:
+            if i < clip.info.frames:
+                return clip, i
+            i -= clip.info.frames
+        raise IndexError(i)
+
+    def crop(self, i: int, region: Any) -> F32:
+        clip, t = self.find(i)
+        return crop_at(clip.path, self.tracks[clip.path.name], region, t)
+
+    def walk(self, path: Sequence[int], region: Any, match: Any) -> tuple[F32, F32]:
+        """(last image, flow first -> last) along `path`, concatenated step by step."""
+        image = self.crop(path[0], region)
+        flow = np.zeros((*image.shape[:2], 2), np.float32)
+        for i in path[1:]:
+            following = self.crop(i, region)
+            flow = concatenate(flow, match(image, following))
+            image = following
+        return image, flow
+
+
+def _calmest(clips: Sequence[Clip], tracks: Mapping[str, Track], reference: Reference) -> Clip:
+    """The clip whose head stays nearest to the pose of the reference."""
+
+    def unrest(clip: Clip) -> float:
+        poses = tracks[clip.path.name].poses
+        return float(np.abs(poses[:, :2, 2] - poses[:, :2, 2].mean(axis=0)).mean())
+
+    return min(clips, key=unrest)
+
+
+def _notes(frames: _Frames, skipped: Mapping[str, str], options: Options) -> dict[str, Any]:
+    tracks = frames.tracks.values()
+    return {
+        "clips": [clip.path.name for clip in frames.clips],
+        "skipped": dict(skipped),
+        "frames": int(frames.registered.size),
+        "unregistered_frames": int((~frames.registered).sum()),
+        "registration_residual_px": float(np.mean([t.residual for t in tracks])),
+        "seed": options.seed,
+        "sync_s": options.sync,
+        "flow": options.flow,
+    }
