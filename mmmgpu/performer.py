@@ -43,8 +43,8 @@ def performer(seed: int, *, size: tuple[int, int] = (256, 256)) -> Performer:
     """Draw one person at random: geometry, skin, hair, light and speaking style.
 
     Args:
-        seed: Which person, an integer >= 0; the same seed is the same person at every size (pores and
-            single hairs apart).
+        seed: Which person, an integer >= 0; the same seed is the same person at every size
+            (pores and single hairs apart).
         size: (height, width) of the pictures [px], each at least 64.
 
     Raises:
