@@ -85,23 +85,23 @@ def _kernel(kernel: str, device: str) -> tuple[Any, list[Any]]:
     stem, _, name = kernel.partition(".")
     compiled = getattr(importlib.import_module(f"mmmgpu.kernels.{stem}"), name)
     with _compiling:
-        _load(compiled.module, device)
+        _load(compiled.module, device).get_kernel_hooks(compiled)
     return compiled, [argument.type for argument in compiled.adj.args]
 
 
 _compiling = threading.Lock()
 
 
-def _load(module: Any, device: str) -> None:
-    """Compile a kernel module or take it from Warp's cache; a damaged cache entry is rebuilt."""
+def _load(module: Any, device: str) -> Any:
+    """A kernel module, compiled or from Warp's cache; a damaged cache entry is rebuilt."""
     target = wp.get_device(device)
     block = _block(device)
     try:
-        module.load(target, block)
+        return module.load(target, block)
     except Exception:  # Warp raises whatever its parsers do
         entry = Path(wp.config.kernel_cache_dir or "", module.get_module_identifier(block))
         shutil.rmtree(entry, ignore_errors=True)
-        module.load(target, block)
+        return module.load(target, block)
 
 
 def _block(device: str) -> int:
