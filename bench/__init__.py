@@ -1,0 +1,1 @@
+"""Benchmarks: validate against the reference, then time, and print the losses too."""

@@ -1,0 +1,77 @@
+"""What is measured: made-up but lifelike inputs, by name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Case:
+    """One operation on one set of arrays; `arrays` are the device arguments in order."""
+
+    name: str
+    operation: str
+    arrays: tuple[np.ndarray, ...]
+    scalars: tuple[float, ...] = ()
+    peer: str | None = None  # a function of bench.peers
+
+
+def smooth_flow(rng, batch, height, width):
+    """Flows like those between mouths: smooth, a few pixels, tearing at a line."""
+    y, x = np.mgrid[:height, :width]
+    phase = rng.uniform(0, 6, (batch, 2, 1, 1))
+    waves = 3 * np.sin(np.stack([y / 20, x / 20]) + phase)
+    waves[:, 1] += 6 * np.sign(y - height / 2) * np.exp(-(((y - height / 2) / height * 6) ** 2))
+    return np.ascontiguousarray(np.moveaxis(waves, 1, -1), np.float32)
+
+
+def splat(rng, batch=50, height=256, width=256, channels=4):
+    field = rng.random((batch, height, width, channels), dtype=np.float32)
+    arrays = field, smooth_flow(rng, batch, height, width)
+    return Case("forward_warp 50x256x256x4", "forward_warp", arrays, peer="forward_warp")
+
+
+def fill(rng, batch=46, height=160, width=192):
+    field = rng.random((batch, height, width, 3), dtype=np.float32)
+    weight = (rng.random((batch, height, width)) > 0.02).astype(np.float32)
+    return Case("fill_holes 46x160x192x3", "fill_holes", (field, weight), (0.5,))
+
+
+def blend(rng, number=46, height=160, width=192):
+    images = rng.random((number, height, width, 3), dtype=np.float32)
+    return Case("blend 46x160x192x3", "blend", (images, rng.random((1, number), np.float32)))
+
+
+def sample(rng, height=480, width=640):
+    field = rng.random((1, height, width, 3), dtype=np.float32)
+    points = rng.uniform(0, [width, height], (1, height * width, 2)).astype(np.float32)
+    return Case("sample 640x480x3 at random", "sample", (field, points))
+
+
+def scan(rng, queries=50, corpus=450, points=16384):
+    arrays = tuple(rng.random((n, points, 2), dtype=np.float32) for n in (queries, corpus))
+    weights = rng.random(points, dtype=np.float32)
+    name = "distance_scan 50x450x16384x2"
+    return Case(name, "distance_scan", (*arrays, weights), peer="distance_scan")
+
+
+CASES: list[Callable[[np.random.Generator], Case]] = [splat, fill, blend, sample, scan]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One frame of synthesis: flows re-oriented, images warped, holes filled, all blended."""
+
+    residual: np.ndarray  # (M, H, W, 2) [px]
+    flows: np.ndarray  # (M, H, W, 2) [px]
+    images: np.ndarray  # (M, H, W, 3)
+    weights: np.ndarray  # (1, M)
+
+
+def chain(rng, number=46, height=160, width=192):
+    flows = smooth_flow(rng, number, height, width)
+    weights = rng.dirichlet(np.ones(number))[None].astype(np.float32)
+    residual = np.tensordot(weights[0], flows, axes=1) - flows
+    images = rng.random((number, height, width, 3), dtype=np.float32)
+    return Chain(residual, flows, images, weights)
