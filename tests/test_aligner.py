@@ -30,7 +30,7 @@ def test_words_and_phones_are_where_the_synthesiser_put_them(speech):
     error = np.subtract([w[1:] for w in found.words], [w[1:] for w in speech.alignment.words])
     assert np.median(np.abs(error)) < 0.015
     assert np.abs(error).max() < 0.08
-    assert abs(np.median(error)) < 0.006
+    assert abs(np.median(error)) < 0.004  # no bias: it would be -0.005 without the half window
 
 
 def test_phones_cover_the_clip(speech):

@@ -320,6 +320,9 @@ def test_a_frame_has_the_label_that_a_count_of_instants_gives(alignment, n_frame
 def test_equal_shares_go_to_the_first_and_pieces_add_up():
     halves = (Segment("A", 0.0, 0.06), Segment("B", 0.06, 0.1))
     assert frame_labels(Alignment(halves, (), 0.1), 4, 25) == ["A", "A", "B", SIL]
+    noisy = (Segment("A", 0.04, 0.06), Segment("B", 0.06, 0.08))
+    assert 0.06 - 0.04 < 0.08 - 0.06
+    assert frame_labels(Alignment(noisy, (), 0.08), 2, 25) == [SIL, "A"]
     pieces = [Segment("A", 0.0, 0.03), Segment("B", 0.03, 0.07), Segment("A", 0.07, 0.1)]
     assert frame_labels(Alignment(tuple(pieces), (), 0.1), 1, 10) == ["A"]
 
