@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from mmmgpu.backends import Backend
-from mmmgpu.basis import Basis
+from mmmgpu.basis import Basis, cut
 from mmmgpu.flows import Matcher, best_flow, matcher, pull
-from mmmgpu.synthesis import NO_TEXTURE, synthesize_one, warp_prototypes
+from mmmgpu.synthesis import NO_TEXTURE, warp_prototypes
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -35,7 +35,9 @@ STEP_RIDGE = 3e-4  # the same for a Gauss-Newton step
 TEXTURE_RIDGE = 1e-6  # the same for beta: makes the programme strictly convex
 STEPS = 2  # Gauss-Newton steps
 OUTLIER = 0.08  # a pixel that differs by more than this counts less in a step
-WAYPOINTS = 2  # prototypes tried as waypoints of the flow to a frame
+WAYPOINTS = 1  # prototypes tried as waypoints of the flow to a frame
+NEAREST = 16  # prototypes that the first estimate of beta is made of
+MARGIN = 4  # [px] kept around the masks
 THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are looked for
 
 
@@ -43,6 +45,7 @@ THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are
 class Analyzer:
     """What analysis needs of a basis, computed once.
 
+    basis: cut to the rectangle `inside` in which the masks are not zero.
     pixels: indices of the n reference pixels with w_f above 0.02; weight (n,): w_f there.
     along_x, along_y: the prototype flows there, (n, M - 1) float32 each.
     gram: Cholesky factor of the regularised Gram matrix of the flows.
@@ -52,6 +55,7 @@ class Analyzer:
     """
 
     basis: Basis
+    inside: tuple[slice, slice]
     match: Matcher
     pixels: NDArray[np.int64]
     weight: F32
@@ -66,6 +70,7 @@ class Analyzer:
 
 def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
     """Compute what does not change from frame to frame; `flow` is one of `flows.MATCHERS`."""
+    basis, inside = _tight(basis)
     pixels = np.flatnonzero(basis.w_f > 0.02)
     weight = basis.w_f.ravel()[pixels]
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
@@ -76,6 +81,7 @@ def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
     texture = np.flatnonzero(basis.w_t > 0.01)
     return Analyzer(
         basis=basis,
+        inside=inside,
         match=matcher(flow),
         pixels=pixels,
         weight=weight,
@@ -97,25 +103,33 @@ def thumbnail(image: F32, mask: F32) -> F32:
     return small.ravel()
 
 
+def _tight(basis: Basis) -> tuple[Basis, tuple[slice, slice]]:
+    """`basis` cut to where its masks are not zero, and where that is."""
+    rows, columns = np.nonzero((basis.w_t > 0.01) | (basis.w_f > 0.02))
+    h, w = basis.w_t.shape
+    left, right = max(0, columns.min() - MARGIN), min(w, columns.max() + 1 + MARGIN)
+    top, bottom = max(0, rows.min() - MARGIN), min(h, rows.max() + 1 + MARGIN)
+    return cut(basis, left, top, right, bottom), (slice(top, bottom), slice(left, right))
+
+
 def analyze(analyzer: Analyzer, image: F32, kernels: Backend) -> tuple[Floats, Floats]:
     """(alpha (M - 1,), beta (M,)) of a region `image`, (h, w, 3) in [0, 1]."""
-    basis = analyzer.basis
-    every = np.arange(len(basis.images))
-    alpha = fit_flow(analyzer, _flow_to(analyzer, image))
-    beta = _fit_texture(analyzer, image, alpha, every, kernels)
-    for _ in range(STEPS - 1):
-        alpha = _refine(analyzer, image, alpha, beta, kernels)
-        used = np.flatnonzero(beta > NO_TEXTURE)
-        beta = _fit_texture(analyzer, image, alpha, used, kernels)
-    alpha = _refine(analyzer, image, alpha, beta, kernels)
-    return alpha, _fit_texture(analyzer, image, alpha, every, kernels)
-
-
-def _flow_to(analyzer: Analyzer, image: F32) -> F32:
-    """Flow from the reference to `image`, direct or through one of the nearest prototypes."""
-    basis = analyzer.basis
-    small = thumbnail(image, basis.w_t)
+    image = np.ascontiguousarray(image[analyzer.inside])
+    small = thumbnail(image, analyzer.basis.w_t)
     order = np.argsort(((analyzer.thumbnails - small) ** 2).sum(axis=1))
+    alpha = fit_flow(analyzer, _flow_to(analyzer, image, order))
+    used = np.sort(order[:NEAREST])
+    for _ in range(STEPS):
+        beta, made = _fit_texture(analyzer, image, alpha, used, kernels)
+        alpha = _refine(analyzer, image, alpha, made)
+        used = np.flatnonzero(beta > NO_TEXTURE)
+    beta, _ = _fit_texture(analyzer, image, alpha, np.arange(len(analyzer.thumbnails)), kernels)
+    return alpha, beta
+
+
+def _flow_to(analyzer: Analyzer, image: F32, order: NDArray[np.int64]) -> F32:
+    """Flow from the reference to `image`, direct or through the first prototypes of `order`."""
+    basis = analyzer.basis
     near = [i for i in order[: WAYPOINTS + 1] if i != basis.reference][:WAYPOINTS]
     via = [(basis.images[i], basis.flows[i]) for i in near]
     return best_flow(basis.images[basis.reference], image, basis.w_t, via, analyzer.match)
@@ -129,16 +143,13 @@ def fit_flow(analyzer: Analyzer, flow: F32) -> Floats:
     return alpha
 
 
-def _refine(
-    analyzer: Analyzer, image: F32, alpha: Floats, beta: Floats, kernels: Backend
-) -> Floats:
-    """One Gauss-Newton step of alpha on the difference between synthesis and `image`.
+def _refine(analyzer: Analyzer, image: F32, alpha: Floats, made: F32) -> Floats:
+    """One Gauss-Newton step of alpha on the difference between its synthesis `made` and `image`.
 
     With e = I - I_syn and g = grad I, both read at p + C_syn(p), and weights w(p):
         (sum_p w C_i' (g g') C_j + r) da_j = -sum_p w C_i' g e - r a_i.
     """
     basis = analyzer.basis
-    made = synthesize_one(basis, alpha, beta, kernels)
     mean = (made + image) / 2
     slope_x, slope_y = cv2.Scharr(mean, -1, 1, 0) / 32, cv2.Scharr(mean, -1, 0, 1) / 32
     flow = basis.flow(alpha)
@@ -162,17 +173,18 @@ def _pulled(analyzer: Analyzer, field: F32, flow: F32) -> F32:
 
 def _fit_texture(
     analyzer: Analyzer, image: F32, alpha: Floats, used: NDArray[np.int64], kernels: Backend
-) -> Floats:
-    """beta (M,), zero outside `used`: the quadratic programme on warped prototypes."""
+) -> tuple[Floats, F32]:
+    """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3)."""
     basis = analyzer.basis
-    warped = kernels.to_host(warp_prototypes(basis, basis.flow(alpha), used, kernels))
+    on_device = warp_prototypes(basis, basis.flow(alpha), used, kernels)
+    warped = kernels.to_host(on_device).reshape(len(used), -1, 3)
     weight = analyzer.texture_weight[:, None]
-    a = warped.reshape(len(used), -1, 3)[:, analyzer.texture_pixels] * weight
-    b = image.reshape(-1, 3)[analyzer.texture_pixels] * weight
-    a = a.reshape(len(used), -1)
+    a = (warped[:, analyzer.texture_pixels] * weight).reshape(len(used), -1)
+    b = (image.reshape(-1, 3)[analyzer.texture_pixels] * weight).ravel()
     beta = np.zeros(len(basis.images))
-    beta[used] = solve_simplex(a @ a.T, a @ b.ravel())
-    return beta
+    beta[used] = solve_simplex(a @ a.T, a @ b)
+    made = beta[used].astype(np.float32) @ warped.reshape(len(used), -1)
+    return beta, made.reshape(image.shape)
 
 
 def solve_simplex(gram: F32, right: F32) -> Floats:

@@ -43,6 +43,19 @@ class Basis:
         return summed
 
 
+def cut(basis: Basis, left: int, top: int, right: int, bottom: int) -> Basis:
+    """The part of a basis in columns left <= x < right and rows top <= y < bottom."""
+    box = (basis.region.box[0] + left, basis.region.box[1] + top, right - left, bottom - top)
+    inside = (slice(top, bottom), slice(left, right))
+    return Basis(
+        np.ascontiguousarray(basis.images[:, inside[0], inside[1]]),
+        np.ascontiguousarray(basis.flows[:, inside[0], inside[1]]),
+        basis.reference,
+        Region(box, basis.region.mouth),
+        *(np.ascontiguousarray(mask[inside]) for mask in (basis.w_f, basis.w_t, basis.cover)),
+    )
+
+
 def make_basis(images: F32, flows: F32, reference: int, region: Region) -> Basis:
     """A `Basis` whose flows fade to 0 where its cover does: outside, the head is rigid."""
     cover = cover_mask(region)

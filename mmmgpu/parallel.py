@@ -1,8 +1,9 @@
 """The same work for many items on all cores, results in order, and a quick end when interrupted."""
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -25,8 +26,14 @@ def map_ordered(
     """
     stop = threading.Event()
     pool = ThreadPoolExecutor(threads)
+    waiting: deque[Future[Result]] = deque()
     try:
-        yield from pool.map(lambda item: function(item, stop.is_set), items)
+        for item in items:  # few are taken in advance: items may be frames of a long video
+            waiting.append(pool.submit(function, item, stop.is_set))
+            if len(waiting) > 2 * threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
     finally:
         stop.set()
         pool.shutdown(wait=True, cancel_futures=True)

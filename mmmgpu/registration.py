@@ -54,15 +54,14 @@ def head_from_frame(frame: NDArray[np.uint8], mouth: Floats) -> Head:
 
 
 def to_gray(frame: NDArray[np.uint8]) -> Gray:
-    gray: Gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
-    return gray
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _carry_back(gray: Gray, pose: Floats, size: tuple[int, int]) -> Gray:
     """`gray` seen from the patch: output pixel p shows ``gray[pose p]``; size is (w, h)."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    back: Gray = cv2.warpPerspective(gray, pose, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return back
+    back = cv2.warpPerspective(gray, pose, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(back, np.uint8)
 
 
 def register(frames: Iterable[NDArray[np.uint8]], head: Head) -> Iterator[tuple[Floats, float]]:
@@ -71,7 +70,7 @@ def register(frames: Iterable[NDArray[np.uint8]], head: Head) -> Iterator[tuple[
     pose: homography reference pixel -> frame pixel, shape (3, 3).
     correlation: normalised correlation of the head with the reference after registration, [-1, 1].
     """
-    flow_of = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     pose = None
     for frame in frames:
         gray = to_gray(frame)
@@ -103,10 +102,11 @@ def _locate(gray: Gray, head: Head) -> Floats:
 def _refine(
     gray: Gray, head: Head, pose: Floats, flow_of: cv2.DISOpticalFlow
 ) -> tuple[Floats, float]:
-    size = head.patch.shape[::-1]
+    size = (head.patch.shape[1], head.patch.shape[0])
+    nothing = np.empty((*head.patch.shape, 2), np.float32)
     for _ in range(3):
         seen = _carry_back(gray, pose, size)
-        step = _fit_homography(flow_of.calc(head.patch, seen, None), head.mask)
+        step = _fit_homography(np.asarray(flow_of.calc(head.patch, seen, nothing)), head.mask)
         pose = pose @ step
         pose = pose / pose[2, 2]
         if np.abs(step - np.eye(3))[:2, 2].max() < 1.0:
@@ -141,7 +141,8 @@ def _fit_homography(flow: NDArray[np.float32], mask: NDArray[np.float32]) -> Flo
     normal = np.array([[1 / half, 0, -w / 2 / half], [0, 1 / half, -h / 2 / half], [0, 0, 1]])
     step = np.append(g, 0.0).reshape(3, 3) + np.eye(3)
     full: Floats = np.linalg.inv(normal) @ step @ normal
-    return full / full[2, 2]
+    full /= full[2, 2]
+    return full
 
 
 def _correlation(head: Head, seen: Gray) -> float:
@@ -184,5 +185,5 @@ def project(pose: Floats, points: Floats) -> Floats:
 
 
 def _homography_between(source: Floats, target: Floats) -> Floats:
-    pose: Floats = cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32))
-    return pose
+    pose = cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32))
+    return np.asarray(pose, np.float64)

@@ -1,0 +1,96 @@
+"""Reconstruction: a real clip analysed and synthesised back, the same in size and length."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.analysis import analyze, prepare_analysis
+from mmmgpu.backends import default_threads, get_backend
+from mmmgpu.compositing import composite
+from mmmgpu.models import Model
+from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
+from mmmgpu.progress import progress
+from mmmgpu.sounds import read_sound
+from mmmgpu.synthesis import synthesize_one
+from mmmgpu.tracks import Track, crop, track_clip
+from mmmgpu.video_writing import write_video
+from mmmgpu.videos import probe, read_frames
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Analysed:
+    """A clip in model coordinates: alpha (T, M - 1), beta (T, M), and its track."""
+
+    track: Track
+    alpha: Floats
+    beta: Floats
+
+
+def analyse_clip(model: Model, clip: Path, *, backend: str = "warp") -> Analysed:
+    """Model coordinates of every frame of `clip`.
+
+    Raises:
+        InputError: The clip cannot be read, or the model's head is not found in it.
+    """
+    track = track_clip(clip, model.reference)
+    analyzer = prepare_analysis(model.basis)
+    kernels = get_backend(backend, 1)
+    region = model.basis.region
+
+    def one(item: tuple[NDArray[np.uint8], Floats], _: Cancelled) -> tuple[Floats, Floats]:
+        return analyze(analyzer, crop(item[0], item[1], track, region), kernels)
+
+    items = zip(read_frames(clip), track.poses, strict=False)
+    found = map_ordered(one, items, threads=default_threads())
+    done = list(progress(found, f"analyse {clip.name}", total=len(track)))
+    return Analysed(track, np.array([a for a, _ in done]), np.array([b for _, b in done]))
+
+
+def reconstruct(
+    model: Model,
+    clip: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    lossless: bool = False,
+    backend: str = "warp",
+) -> Analysed:
+    """Analyse `clip` and write its reconstruction to `out`, with the sound of the clip.
+
+    Nothing is matched or added: what the model predicts is seen in the clip's own exposure; outside
+    the cover the pixels are those of the clip.
+
+    Args:
+        model: The person in the clip.
+        clip: A video file.
+        out: ``.mp4``, ``.mov`` or ``.mkv``.
+        lossless: Exact RGB.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Raises:
+        InputError: The clip cannot be read or registered, or `out` not be written.
+    """
+    clip = Path(clip)
+    info = probe(clip, minimum_frames=2)
+    with one_thread_each():
+        analysed = analyse_clip(model, clip, backend=backend)
+        frames = reconstructed_frames(model, clip, analysed, backend=backend)
+        sound = read_sound(clip, mono=False) if info.has_sound else None
+        write_video(out, frames, fps=info.fps, sound=sound, lossless=lossless)
+    return analysed
+
+
+def reconstructed_frames(
+    model: Model, clip: Path, analysed: Analysed, *, backend: str = "warp"
+) -> Iterator[NDArray[np.uint8]]:
+    """The frames of `clip` with the mouth that the model makes of its coordinates."""
+    kernels, basis, track = get_backend(backend), model.basis, analysed.track
+    rows = zip(read_frames(clip), track.poses, analysed.alpha, analysed.beta, strict=False)
+    for frame, pose, alpha, beta in rows:
+        image = synthesize_one(basis, alpha, beta, kernels)
+        yield composite(frame, image, basis.cover, pose, track, basis.region)

@@ -1,0 +1,150 @@
+"""Speaking: from phones with times to a video of the model's person saying them.
+
+phones -> trajectories (Eq. 3) -> frame rate of the background -> images (Eq. 1-2) -> composite
+"""
+
+import os
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.alignments import Alignment, frame_labels
+from mmmgpu.backends import get_backend
+from mmmgpu.backgrounds import Background, extended, open_background
+from mmmgpu.compositing import composite_matched
+from mmmgpu.errors import InputError
+from mmmgpu.models import Model, project_on_simplex, trajectories
+from mmmgpu.parallel import one_thread_each
+from mmmgpu.phones import SIL
+from mmmgpu.progress import progress
+from mmmgpu.synthesis import synthesize_one
+from mmmgpu.trajectory_files import Trajectory
+from mmmgpu.video_writing import write_video
+from mmmgpu.voices import Speech
+
+Floats = NDArray[np.float64]
+
+ARTICULATION = (0.5, 1.5)  # least and most
+
+
+def speak(
+    model: Model,
+    speech: Speech,
+    out: str | os.PathLike[str],
+    *,
+    background: str | os.PathLike[str] | None = None,
+    articulation: float = 1.0,
+    lossless: bool = False,
+    backend: str = "warp",
+) -> Trajectory:
+    """Write a video of the model's person saying `speech`, and return what the mouth did.
+
+    Args:
+        model: A trained model.
+        speech: Sound and alignment: from `voices.say`, or a recording with its own.
+        out: ``.mp4``, ``.mov`` or ``.mkv``.
+        background: A clip of the person; None uses the one stored in the model.
+        articulation: Scales the movement about the silent mouth, 0.5 to 1.5.
+        lossless: Exact RGB.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Raises:
+        InputError: The background cannot be read or registered, or `out` not be written.
+    """
+    trajectory = plan(model, speech.alignment, articulation=articulation)
+    sound = (speech.samples, speech.rate)
+    render(
+        model,
+        trajectory,
+        out,
+        sound=sound,
+        background=background,
+        lossless=lossless,
+        backend=backend,
+    )
+    return trajectory
+
+
+def plan(model: Model, alignment: Alignment, *, articulation: float = 1.0) -> Trajectory:
+    """The trajectory of `alignment` at the model's frame rate (Eq. 3), beta on the simplex.
+
+    Raises:
+        InputError: `articulation` is outside 0.5 to 1.5.
+    """
+    if not ARTICULATION[0] <= articulation <= ARTICULATION[1]:
+        raise InputError(f"articulation must be between 0.5 and 1.5, got {articulation}")
+    frames = max(1, int(np.ceil(alignment.duration * model.fps - 1e-6)))
+    labels = frame_labels(alignment, frames, float(model.fps))
+    alpha, beta = (
+        scale_about(y, neutral, articulation)
+        for y, neutral in zip(trajectories(model, labels), silent_mouth(model), strict=True)
+    )
+    return Trajectory(tuple(labels), alpha, project_on_simplex(beta), model.fps)
+
+
+def silent_mouth(model: Model) -> tuple[Floats, Floats]:
+    """(alpha (M - 1,), beta (M,)) of silence; the reference, where no silence was seen."""
+    if SIL in model.alpha.trained.labels:
+        row = model.alpha.trained.labels.index(SIL)
+        return model.alpha.trained.mean[row], model.beta.trained.mean[row]
+    beta = np.zeros(len(model.basis.images))
+    beta[model.basis.reference] = 1
+    return np.zeros(len(beta) - 1), beta
+
+
+def scale_about(y: Floats, centre: Floats, factor: float) -> Floats:
+    """``centre + factor (y - centre)``; exactly `y` for a factor of 1."""
+    return y if factor == 1 else centre + factor * (y - centre)
+
+
+def at_rate(trajectory: Trajectory, fps: Fraction) -> Trajectory:
+    """`trajectory` at another frame rate: linear between the middles of its frames."""
+    if fps == trajectory.fps:
+        return trajectory
+    length = max(1, int(np.ceil(len(trajectory) / trajectory.fps * fps - Fraction(1, 10**6))))
+    middle = (np.arange(length) + 0.5) * float(trajectory.fps / fps) - 0.5
+    here = np.arange(len(trajectory))
+    alpha, beta = (
+        np.stack([np.interp(middle, here, column) for column in z.T], axis=1)
+        for z in (trajectory.alpha, trajectory.beta)
+    )
+    nearest = np.clip(np.rint(middle), 0, len(trajectory) - 1).astype(int)
+    labels = tuple(trajectory.labels[i] for i in nearest)
+    return Trajectory(labels, alpha, beta, fps)
+
+
+def render(
+    model: Model,
+    trajectory: Trajectory,
+    out: str | os.PathLike[str],
+    *,
+    sound: tuple[NDArray[np.float32], int] | None = None,
+    background: str | os.PathLike[str] | None = None,
+    lossless: bool = False,
+    backend: str = "warp",
+) -> None:
+    """Write the video of a trajectory; see `speak` for the arguments.
+
+    sound: (samples (n,) or (n, channels), rate [Hz]), starting with the first frame.
+    """
+    place = None if background is None else Path(background)
+    with one_thread_each(), open_background(model, place) as behind:
+        frames = spoken_frames(model, at_rate(trajectory, behind.fps), behind, backend=backend)
+        write_video(out, frames, fps=behind.fps, sound=sound, lossless=lossless)
+
+
+def spoken_frames(
+    model: Model, trajectory: Trajectory, background: Background, *, backend: str = "warp"
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames of a trajectory on a background of the same frame rate."""
+    kernels, basis, track = get_backend(backend), model.basis, background.track
+    pictures = extended(background, len(trajectory))
+    numbered = progress(pictures, "render", total=len(trajectory))
+    for i, (frame, t) in enumerate(numbered):
+        image = synthesize_one(basis, trajectory.alpha[i], trajectory.beta[i], kernels)
+        rng = np.random.default_rng([i, len(trajectory)])
+        pose = track.poses[t]
+        yield composite_matched(frame, image, basis.cover, pose, track, basis.region, rng)
