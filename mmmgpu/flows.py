@@ -36,7 +36,7 @@ def matcher(name: str = "dis") -> Matcher:
 
 
 def _dis() -> Any:
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
     dis.setGradientDescentIterations(25)
     return dis
@@ -44,8 +44,8 @@ def _dis() -> Any:
 
 _ALGORITHMS: dict[str, Callable[[], Any]] = {
     "dis": _dis,
-    "farneback": cv2.FarnebackOpticalFlow_create,
-    "tvl1": cv2.optflow.DualTVL1OpticalFlow_create,
+    "farneback": cv2.FarnebackOpticalFlow.create,
+    "tvl1": cv2.optflow.DualTVL1OpticalFlow.create,
 }
 MATCHERS = tuple(_ALGORITHMS)
 
@@ -61,8 +61,8 @@ def pull(field: F32, flow: F32) -> F32:
     h, w = flow.shape[:2]
     x = np.arange(w, dtype=np.float32) + flow[..., 0]
     y = np.arange(h, dtype=np.float32)[:, None] + flow[..., 1]
-    seen: F32 = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return seen
+    seen = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, np.float32)
 
 
 def concatenate(first: F32, second: F32) -> F32:
@@ -107,7 +107,7 @@ def shortest_paths(coordinates: NDArray[np.floating[Any]], start: int) -> NDArra
     lengths = distance.ravel() + 1e-9  # equal frames still need an edge
     edges = csr_matrix((lengths, (rows, neighbour.ravel())), shape=(n, n))
     length, before = dijkstra(edges, directed=False, indices=start, return_predecessors=True)
-    before = before.astype(np.int64)
+    before = np.asarray(before, np.int64)
     before[~np.isfinite(length)] = start
     before[start] = -1
     return before

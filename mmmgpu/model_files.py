@@ -190,10 +190,8 @@ def _assemble(t: Tensors, facts: dict[str, Any]) -> Model:
         t["images"], t["flows"], facts["reference"], region, t["w_f"], t["w_t"], t["cover"]
     )
     head = Head(t["head.patch"], t["head.mask"], t["head.to_frame"])
-    track = Track(
-        *(t[f"calm.{n}"] for n in ("poses", "registered", "correlation", "gain", "offset")),
-        residual=facts["calm"]["residual"],
-    )
+    seen = ("poses", "registered", "correlation", "gain", "offset")
+    track = Track(**{n: t[f"calm.{n}"] for n in seen}, residual=facts["calm"]["residual"])
     return Model(
         basis=basis,
         reference=Reference(head, t["reference.colours"], t["reference.colour_points"], region),

@@ -56,8 +56,7 @@ def _find_mouth(
 ) -> tuple[float, float, float]:
     """(x, y, width) [px] in `frame`: first in the raw picture, then in the stabilised one."""
     some = [corpus[i] for i in _spread(len(corpus), SEARCH_CLIPS)]
-    total = np.zeros(0)
-    scale = 1.0
+    total, scale = np.zeros(0, np.float32), 1.0
     for clip in some:
         small, scale = shrink(islice(read_frames(clip.path), SEARCH_FRAMES))
         motion = speech_motion(small, _energy(clip, len(small), sync))
@@ -74,7 +73,8 @@ def _spread(n: int, most: int) -> list[int]:
 
 
 def _fit(motion: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    return np.asarray(cv2.resize(motion, (shape[1], shape[0]), interpolation=cv2.INTER_AREA))
+    resized = cv2.resize(motion, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    return np.asarray(resized, np.float32)
 
 
 def _energy(clip: Clip, frames: int, sync: float) -> Floats:
@@ -100,7 +100,8 @@ def _second_look(
         for frame, (pose, _) in zip(frames, register(frames, head), strict=True):
             gray = to_gray(frame)
             matrix = pose @ to_frame
-            pictures.append(cv2.warpPerspective(gray, matrix, (side, side), flags=flags))
+            seen_now = cv2.warpPerspective(gray, matrix, (side, side), flags=flags)
+            pictures.append(np.asarray(seen_now, np.uint8))
             inside = cv2.warpPerspective(np.ones_like(gray), matrix, (side, side), flags=flags)
             seen = np.minimum(seen, inside)
         total += speech_motion(pictures, _energy(clip, len(pictures), sync))

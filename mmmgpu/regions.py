@@ -102,12 +102,13 @@ def _soft(region: Region, across: float, above: float, below: float, feather: fl
     radius = ((u[None, :] / across) ** 2.5 + v[:, None] ** 2.5) ** (1 / 2.5)
     # the radius grows by 1 over `across` widths; measure the feather along that axis
     ramp = np.clip((1 + feather / across - radius) / (feather / across), 0, 1)
-    mask = (ramp * ramp * (3 - 2 * ramp)).astype(np.float32)
+    mask: F32 = (ramp * ramp * (3 - 2 * ramp)).astype(np.float32)
     border = np.ones((h, w), np.float32)  # never let the mask be cut by the edge of the region
     distance = np.minimum(np.arange(w), np.arange(w)[::-1])[None, :]
     down = np.minimum(np.arange(h), np.arange(h)[::-1])[:, None]
     border = np.clip(np.minimum(distance, down) / (0.1 * width), 0, 1).astype(np.float32)
-    return mask * border
+    mask *= border
+    return mask
 
 
 def speech_motion(frames: Sequence[NDArray[np.uint8]], energy: Floats) -> F32:
@@ -124,7 +125,8 @@ def speech_motion(frames: Sequence[NDArray[np.uint8]], energy: Floats) -> F32:
     together = np.tensordot(loud, change, axes=1) / len(loud)
     agreement = together / np.sqrt(change.var(axis=0) + 0.02)
     motion = np.maximum(together, 0) * np.maximum(agreement, 0)
-    return (motion / max(float(motion.sum()), 1e-12)).astype(np.float32)
+    share: F32 = (motion / max(float(motion.sum()), 1e-12)).astype(np.float32)
+    return share
 
 
 def locate_mouth(motion: F32) -> tuple[float, float, float]:
@@ -173,5 +175,6 @@ def shrink(frames: Iterable[NDArray[np.uint8]]) -> tuple[list[NDArray[np.uint8]]
     for frame in frames:
         scale = SEARCH_WIDTH / max(frame.shape[:2])
         gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
-        small.append(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+        less = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small.append(np.asarray(less, np.uint8))
     return small, scale

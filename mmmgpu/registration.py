@@ -8,6 +8,7 @@ reweighted least squares. Not here: where the head is (`regions`), what is done 
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -99,14 +100,11 @@ def _locate(gray: Gray, head: Head) -> Floats:
     return np.array([[scale, 0, scale * u], [0, scale, scale * v], [0, 0, 1]])
 
 
-def _refine(
-    gray: Gray, head: Head, pose: Floats, flow_of: cv2.DISOpticalFlow
-) -> tuple[Floats, float]:
+def _refine(gray: Gray, head: Head, pose: Floats, flow_of: Any) -> tuple[Floats, float]:
     size = (head.patch.shape[1], head.patch.shape[0])
-    nothing = np.empty((*head.patch.shape, 2), np.float32)
     for _ in range(3):
         seen = _carry_back(gray, pose, size)
-        step = _fit_homography(np.asarray(flow_of.calc(head.patch, seen, nothing)), head.mask)
+        step = _fit_homography(flow_of.calc(head.patch, seen, None), head.mask)
         pose = pose @ step
         pose = pose / pose[2, 2]
         if np.abs(step - np.eye(3))[:2, 2].max() < 1.0:

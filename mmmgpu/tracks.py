@@ -75,7 +75,7 @@ def _colours(frame: NDArray[np.uint8], points: Floats) -> F32:
     soft = cv2.GaussianBlur(frame, (0, 0), 1.0)
     x, y = points[:, 0].astype(np.float32), points[:, 1].astype(np.float32)
     seen = cv2.remap(soft, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return seen.reshape(-1, 3).astype(np.float32) / 255
+    return np.asarray(seen.reshape(-1, 3) / 255, np.float32)
 
 
 def track_clip(path: Path, reference: Reference) -> Track:
