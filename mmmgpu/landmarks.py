@@ -1,0 +1,75 @@
+"""Landmarks of a face tracker, for measuring only: no training reads them.
+
+``NAME.npz`` beside a clip holds ``points``, float32 (frames, 103, 2), (x, y) [px]: outer lip 0-19
+from the right corner along the lower lip, inner lip 20-39, then jaw, nose, eyes and cheeks.
+"""
+
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.basis import Basis
+from mmmgpu.errors import InputError
+from mmmgpu.registration import project
+
+Floats = NDArray[np.float64]
+
+OUTER_LIP, LIPS = slice(0, 20), slice(0, 40)
+LOWER, UPPER = 5, 15  # middle of the outer lower and upper lip
+HULL_SCALE = 1.5  # of the outer lip's hull, about its centre: where pictures are compared
+
+
+def read_landmarks(folder: Path, clip: Path, frames: int) -> Floats:
+    """The landmarks of `clip`, (frames, n, 2) [px].
+
+    Raises:
+        InputError: There are none, or not for so many frames, or some are not finite.
+    """
+    path = folder / f"{clip.stem}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            points = np.asarray(arrays["points"], np.float64)
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
+        raise InputError(f"{path}: no landmarks of {clip} ({e}); give --landmarks DIR") from e
+    if points.ndim != 3 or points.shape[0] != frames or points.shape[1] < 40:
+        raise InputError(
+            f"{path}: must hold points of shape ({frames}, 40 or more, 2), has {points.shape}"
+        )
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: holds NaN or infinity; leave the clip out")
+    return points
+
+
+def moved_landmarks(basis: Basis, alpha: Floats, points: Floats) -> Floats:
+    """`points` (n, 2) of the reference frame moved by C_syn(alpha): (T, n, 2) [reference px]."""
+    at = points - np.array(basis.region.box[:2])
+    where = at.astype(np.float32)[None]
+    moved = []
+    for a in alpha:
+        step = cv2.remap(basis.flow(a), where[..., 0], where[..., 1], cv2.INTER_LINEAR)
+        moved.append(points + step[0])
+    return np.array(moved)
+
+
+def carried(poses: Floats, points: Floats) -> Floats:
+    """Points (T, n, 2) carried by the poses (T, 3, 3) of their frames."""
+    return np.array([project(pose, p) for pose, p in zip(poses, points, strict=True)])
+
+
+def lip_opening(points: Floats) -> Floats:
+    """Height between the middles of the outer lips [px], (T, n, 2) -> (T,)."""
+    return np.asarray(points[:, LOWER, 1] - points[:, UPPER, 1])
+
+
+def mouth_hull(points: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels of a picture inside the hull of the outer lip (n, 2), scaled about its centre."""
+    hull = cv2.convexHull(points[OUTER_LIP].astype(np.float32))[:, 0]
+    moments = cv2.moments(hull)
+    centre = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+    corners = np.rint((centre + HULL_SCALE * (hull - centre)) * 16).astype(np.int32)
+    inside = np.zeros(shape[:2], np.uint8)
+    cv2.fillConvexPoly(inside, corners, 1, shift=4)
+    return inside > 0
