@@ -131,16 +131,51 @@ def test_a_chain_of_operations_stays_on_the_device(backend):
         assert_allclose(actual, desired, rtol=0, atol=1e-5 * np.abs(desired).max())
 
 
+def test_every_output_is_written_and_no_scratch_is_read_before(backend, monkeypatch):
+    k = get_backend(backend)
+    rng = np.random.default_rng(0)
+    field, flow = on_device(k, rng.normal(0, 1, (9, 7, 6, 5)), rng.normal(0, 3, (9, 7, 6, 2)))
+    weights, rows, shares = on_device(
+        k, rng.random((2, 9)), rng.normal(0, 1, (9, 42, 5)), rng.random(42)
+    )
+
+    def everything():
+        warped, weight = k.forward_warp(field, flow)
+        filled = k.fill_holes(warped, weight, 0.4)
+        rest = k.blend(filled, weights), k.distance_scan(rows, rows, shares)
+        return [k.to_host(a).copy() for a in (warped, weight, filled, *rest)]
+
+    clean = everything()
+    empty = type(k).empty
+
+    def poisoned(self, *shape, dtype=np.float32):
+        array = empty(self, *shape, dtype=dtype)
+        getattr(array, "fill_", getattr(array, "fill", None))(-77777)
+        return array
+
+    monkeypatch.setattr(type(k), "empty", poisoned)
+    for actual, desired in zip(everything(), clean, strict=True):
+        assert_array_equal(actual, desired)
+
+
 def test_device_operations_may_be_called_from_many_threads(backend):
     k = get_backend(backend)
-    field, flow = on_device(
-        k, np.random.default_rng(0).random((3, 16, 16, 4)), np.ones((1, 16, 16, 2))
-    )
-    alone = k.to_host(k.forward_warp(field, flow)[0])
-    with ThreadPoolExecutor(4) as pool:
-        results = list(pool.map(lambda _: k.to_host(k.forward_warp(field, flow)[0]), range(32)))
-    for result in results:
-        assert_array_equal(result, alone)
+    rng = np.random.default_rng(0)
+    given = [on_device(k, rng.random((2, n, n, 3)), np.ones((1, n, n, 2))) for n in range(3, 11)]
+
+    def warp(i):
+        return k.to_host(k.forward_warp(*given[i % len(given)])[0])
+
+    alone = [warp(i) for i in range(len(given))]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads change between any two lines
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            results = list(pool.map(warp, range(400)))
+    finally:
+        sys.setswitchinterval(interval)
+    for i, result in enumerate(results):
+        assert_array_equal(result, alone[i % len(given)])
 
 
 def test_a_field_without_holes_is_returned_as_it_is(backend):

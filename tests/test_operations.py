@@ -104,6 +104,18 @@ def test_batch_axes_broadcast(backend):
         assert_array_equal(warped[i, j], one)
 
 
+@pytest.mark.parametrize(("fields", "sets"), [((), (3,)), ((3,), (1,)), ((1,), (3,)), ((3,), (3,))])
+def test_points_and_fields_broadcast(backend, fields, sets):
+    rng = np.random.default_rng(0)
+    field = rng.normal(0, 1, (*fields, 4, 5, 2)).astype(np.float32)
+    points = rng.uniform(0, 4, (*sets, 6, 2)).astype(np.float32)
+    sampled = operations.sample(field, points, backend=backend)
+    assert sampled.shape == (3, 6, 2)
+    every = np.broadcast_to(field, (3, 4, 5, 2)), np.broadcast_to(points, (3, 6, 2))
+    for b, (f, p) in enumerate(zip(*every, strict=True)):
+        assert_array_equal(sampled[b], operations.sample(f, p, backend=backend))
+
+
 def test_batch_axes_that_do_not_broadcast_are_named():
     with pytest.raises(InputError, match=r"field \(2,\), flow \(3,\)"):
         call("forward_warp", flow=np.zeros((3, 4, 5, 2)))
