@@ -39,11 +39,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     write (disk full, no permission, ...) is an InputError; other exceptions pass unchanged.
     """
     target = Path(path)
-    temporary = target.absolute().with_name(f".mmmgpu-{secrets.token_hex(6)}{target.suffix}")
+    temporary = _temporary(target)
     try:
-        if target.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        _create(temporary, target)
         yield temporary
         _flush_to_disk(temporary)
         os.replace(temporary, target)
@@ -53,6 +51,34 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise InputError(f"cannot write {target}: {_REMEDIES[error.errno]}") from error
     finally:
         _remove(temporary)
+
+
+def require_writable(path: str | os.PathLike[str]) -> None:
+    """Raise InputError, which says why, unless the file `path` can be written.
+
+    Its folder is made where it does not exist; the file itself is neither made nor changed.
+    """
+    target = Path(path)
+    require_folder(target.parent)
+    temporary = _temporary(target)
+    try:
+        _create(temporary, target)
+    except OSError as error:
+        reason = _REMEDIES.get(error.errno or 0, str(error))
+        raise InputError(f"cannot write {target}: {reason}") from error
+    finally:
+        _remove(temporary)
+
+
+def _temporary(target: Path) -> Path:
+    return target.absolute().with_name(f".mmmgpu-{secrets.token_hex(6)}{target.suffix}")
+
+
+def _create(temporary: Path, target: Path) -> None:
+    """Make the empty file `temporary`, unless `target` is a folder."""
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
 
 
 def _is_about(error: OSError, temporary: Path) -> bool:

@@ -73,9 +73,7 @@ def write_video(
     Raises InputError for another suffix, for no frames, for frames of different sizes, and where
     the file cannot be written (folder, permission, disk full).
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in _FORMATS:
-        raise InputError(f"{path}: cannot write '{suffix}' files; name it .mp4, .mov or .mkv")
+    suffix = require_video_name(path)
     recipe = _LOSSLESS[suffix] if lossless else _LOSSY
     rate = Fraction(fps)
     count = 0
@@ -97,6 +95,14 @@ def write_video(
         write_frame(None)
         write_sound(None)
     return count
+
+
+def require_video_name(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of `path` in small letters; InputError if no such video can be written."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in _FORMATS:
+        raise InputError(f"{path}: cannot write '{suffix}' files; name it .mp4, .mov or .mkv")
+    return suffix
 
 
 def _open_picture(
