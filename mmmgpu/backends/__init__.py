@@ -2,7 +2,8 @@
 
 A backend is named ``name`` or ``name:device``: ``"numpy"``, ``"warp"`` (all CPU cores),
 ``"warp:cuda:0"``, ``"opencl"``, ``"opencl:0:0"`` (platform and device number). To add one, write a
-module with ``open_backend(device, threads)`` and add its line to `BACKENDS`.
+module with ``open_backend(device, threads)`` and ``list_devices()``, and add its line to
+`BACKENDS`.
 """
 
 import functools
@@ -51,6 +52,16 @@ class Backend(Protocol):
         """(K, P, C), (N, P, C), (P,) -> (K, N)."""
 
 
+def list_devices(family: str) -> dict[str, str]:
+    """Names for `get_backend` with what they stand for, of one of `BACKENDS`.
+
+    Raises:
+        InputError: Its library is not installed.
+    """
+    found: dict[str, str] = _module(family).list_devices()
+    return found
+
+
 @functools.cache
 def get_backend(name: str, threads: int | None = None) -> Backend:
     """The backend called `name`, imported and opened on first use.
@@ -69,13 +80,17 @@ def get_backend(name: str, threads: int | None = None) -> Backend:
         raise InputError(f"unknown backend {name!r}; choose one of {sorted(BACKENDS)}")
     if threads is not None and threads < 1:
         raise InputError(f"threads must be at least 1, got {threads}")
+    opened = _module(family).open_backend(device, threads or default_threads())
+    return cast(Backend, opened)
+
+
+def _module(family: str) -> Any:
     try:
-        module = importlib.import_module(BACKENDS[family])
+        return importlib.import_module(BACKENDS[family])
     except ModuleNotFoundError as e:
         raise InputError(
             f"backend {family!r} needs {e.name!r}, which is not installed; pip install 'mmmgpu'"
         ) from e
-    return cast(Backend, module.open_backend(device, threads or default_threads()))
 
 
 def default_threads() -> int:

@@ -31,8 +31,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 def open_backend(device: str, threads: int) -> "Warp":
     """The backend on a Warp device: "" or "cpu", "cuda:0", ..."""
-    wp.config.log_level = wp.LOG_ERROR  # Warp would print its banner to stdout
-    cast(Any, wp).init()
+    _start()
     try:
         found = wp.get_device(device or "cpu")
     except ValueError:
@@ -42,6 +41,17 @@ def open_backend(device: str, threads: int) -> "Warp":
         _keep_freed_memory()
         return Warp(workers=threads, device="cpu", threads=threads)
     return Warp(workers=GPU_WORKERS, device=found.alias, threads=1)
+
+
+def list_devices() -> dict[str, str]:
+    """Names for `get_backend` and what they stand for."""
+    _start()
+    return {f"warp:{d.alias}": f"{d.name}, Warp {wp.__version__}" for d in wp.get_devices()}
+
+
+def _start() -> None:
+    wp.config.log_level = wp.LOG_ERROR  # Warp would print its banner to stdout
+    cast(Any, wp).init()
 
 
 def _keep_freed_memory() -> None:

@@ -7,7 +7,8 @@ sizes are fixed, for PoCL compiles a kernel anew for each.
 import functools
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -24,19 +25,15 @@ from mmmgpu.errors import InputError
 
 LOCAL = 16  # work-items of a group; 1 where there are too few to go round
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # PoCL before and after 4.0
+NO_CACHE = {"POCL_KERNEL_CACHE": "0"}  # a damaged entry would abort the process
 
 
 def open_backend(device: str, threads: int) -> "OpenCL":
     """The backend on an OpenCL device: "" for the first CPU (else the first of all), or "0:0"."""
-    for variable in THREADS:  # read when the driver is loaded, on the first call below
-        os.environ.setdefault(variable, str(threads))
-    os.environ.setdefault("POCL_KERNEL_CACHE", "0")  # a damaged entry would abort the process
     name_unknown_cpu()
-    present = {
-        f"{i}:{j}": d
-        for i, platform in enumerate(cl.get_platforms())
-        for j, d in enumerate(platform.get_devices())
-    }
+    with _defaults(dict.fromkeys(THREADS, str(threads)) | NO_CACHE):  # read when a driver loads
+        platforms = [p.get_devices() for p in cl.get_platforms()]
+    present = {f"{i}:{j}": d for i, found in enumerate(platforms) for j, d in enumerate(found)}
     cpus = [name for name, d in present.items() if d.type & cl.device_type.CPU]
     chosen = device or next(iter([*cpus, *present]), "")
     if chosen not in present:
@@ -48,6 +45,34 @@ def open_backend(device: str, threads: int) -> "OpenCL":
     queue = cl.CommandQueue(cl.Context([found]))
     on_cpu = bool(found.type & cl.device_type.CPU)
     return OpenCL(found.max_compute_units if on_cpu else GPU_WORKERS, queue)
+
+
+@contextmanager
+def _defaults(variables: dict[str, str]) -> Iterator[None]:
+    """Set those environment variables that are not set, for a while: children inherit nothing."""
+    added = {name: value for name, value in variables.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
+
+
+def list_devices() -> dict[str, str]:
+    """Names for `get_backend` and what they stand for."""
+    return {f"opencl:{name}": f"{d.name}, {d.version}" for name, d in _present().items()}
+
+
+def _present() -> dict[str, Any]:
+    """OpenCL devices by platform and device number. The first call loads the drivers."""
+    os.environ.setdefault("POCL_KERNEL_CACHE", "0")  # a damaged entry would abort the process
+    name_unknown_cpu()
+    return {
+        f"{i}:{j}": device
+        for i, platform in enumerate(cl.get_platforms())
+        for j, device in enumerate(platform.get_devices())
+    }
 
 
 @dataclass(frozen=True)

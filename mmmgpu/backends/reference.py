@@ -22,6 +22,11 @@ def open_backend(device: str, threads: int | None) -> "Reference":
     return Reference()
 
 
+def list_devices() -> dict[str, str]:
+    """Names for `get_backend` and what they stand for."""
+    return {"numpy": f"NumPy {np.__version__}"}
+
+
 @dataclass(frozen=True)
 class Reference:
     """The operations in plain NumPy; device arrays are NumPy arrays."""
