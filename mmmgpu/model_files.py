@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.basis import Basis
 from mmmgpu.errors import InputError
-from mmmgpu.files import atomic_path
+from mmmgpu.files import write_bytes
 from mmmgpu.models import Calm, Model
 from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.regions import Region
@@ -33,7 +33,7 @@ VERSION = 1
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write `model` to `path`, whole or not at all."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     header = {
         "format": FORMAT,
@@ -41,8 +41,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
         "model": json.dumps(_facts(model), ensure_ascii=False, allow_nan=False),
     }
     tensors = {name: np.ascontiguousarray(value) for name, value in _tensors(model).items()}
-    with atomic_path(path) as temporary:
-        save_file(tensors, str(temporary), metadata=header)
+    write_bytes(path, save(tensors, metadata=header))  # its save_file hides why it fails
 
 
 def load(path: str | os.PathLike[str]) -> Model:
