@@ -10,10 +10,12 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mmmgpu.errors import InputError
 from mmmgpu.files import atomic_path, require_folder, write_text
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -26,25 +28,39 @@ def fingerprint(files: Sequence[Path], options: Mapping[str, Any]) -> str:
 
 
 def open_checkpoints(folder: Path, mark: str) -> Path:
-    """`folder`, holding only steps made under the fingerprint `mark`."""
-    name = folder / "fingerprint"
-    if folder.exists() and (not name.is_file() or name.read_text() != mark):
-        shutil.rmtree(folder)
-    require_folder(folder)
+    """`folder`, holding only steps made under the fingerprint `mark`.
+
+    Raises:
+        InputError: The folder holds files but no fingerprint: it is not ours to empty.
+    """
+    name = require_folder(folder) / "fingerprint"
+    if name.is_file():
+        if name.read_text() != mark:
+            shutil.rmtree(folder)
+            require_folder(folder)
+    elif any(not file.name.startswith(".mmmgpu-") for file in folder.iterdir()):
+        raise InputError(
+            f"{folder}: is needed for steps of the work but holds files not made by mmmgpu; "
+            "move it or choose another name for the result"
+        )
     write_text(name, mark)
     return folder
 
 
 def read_step(folder: Path, name: str) -> dict[str, NDArray[Any]] | None:
-    """The arrays of a finished step; None if it has yet to be done."""
+    """The arrays of a finished step; None if it has yet to be done, or its file is damaged."""
     path = folder / f"{name}.npz"
     if not path.is_file():
         return None
-    with np.load(path, allow_pickle=False) as arrays:
-        return dict(arrays)
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return dict(arrays)
+    except (OSError, EOFError, ValueError, BadZipFile):
+        return None
 
 
 def write_step(folder: Path, name: str, arrays: Arrays) -> None:
     """Keep the arrays of a finished step."""
     with atomic_path(folder / f"{name}.npz") as temporary:
-        np.savez(temporary, allow_pickle=False, **arrays)
+        # NumPy before 2.2 would take `allow_pickle` for the name of an array
+        np.savez(temporary, **arrays)  # type: ignore[arg-type]

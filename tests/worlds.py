@@ -1,0 +1,69 @@
+"""Small worlds for tests: a drawn person saying a few phones, as clips with sound and alignments."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mmmgpu.alignments import Alignment, Segment, cover, write_textgrid
+from mmmgpu.performer import Articulation, Performer, articulate, performer, render
+from mmmgpu.video_writing import write_video
+
+FPS = 25
+RATE = 8000
+SENTENCES = (
+    "B IY M AA W UW F AE",
+    "L OW S EH P AH D IY",
+    "SH UW K AA N EY V ER",
+    "G AE B OW T IY M UW",
+)
+
+
+@dataclass(frozen=True)
+class World:
+    """Clips of one performer with their truth.
+
+    face: who speaks. clips: video files. motions: what each clip shows.
+    alignments: the folder of their TextGrids.
+    """
+
+    face: Performer
+    clips: tuple[Path, ...]
+    motions: tuple[Articulation, ...]
+    alignments: Path
+
+
+def say(sentence, *, phone=0.15, silence=0.3):
+    """The phones of `sentence` with silence about them."""
+    labels = sentence.split()
+    times = silence + phone * np.arange(len(labels) + 1)
+    said = [Segment(label, *t) for label, *t in zip(labels, times, times[1:], strict=False)]
+    duration = np.ceil((times[-1] + silence) * FPS) / FPS
+    return Alignment(cover(said, duration), (), float(duration))
+
+
+def voice(alignment, rng):
+    """Noise (n,) that is loud in vowels and all but absent in silence."""
+    samples = np.zeros(round(alignment.duration * RATE))
+    for label, start, end in alignment.phones:
+        loudness = 0.002 if label == "SIL" else 0.3 if label[0] in "AEIOU" else 0.1
+        part = slice(round(start * RATE), round(end * RATE))
+        samples[part] = loudness * rng.standard_normal(len(samples[part]))
+    return np.clip(samples, -1, 1).astype(np.float32)
+
+
+def make_world(folder, *, seed=5, size=(160, 144), sentences=SENTENCES):
+    """Render `sentences` into `folder`, losslessly, with camera noise and head motion."""
+    face = performer(seed, size=size)
+    clips, motions = [], []
+    for i, sentence in enumerate(sentences):
+        rng = np.random.default_rng([seed, i])
+        alignment = say(sentence)
+        motion = articulate(face, alignment.phones, round(alignment.duration * FPS), FPS, rng)
+        clip = folder / f"clip {i}.mkv"
+        sound = (voice(alignment, rng), RATE)
+        write_video(clip, render(face, motion, rng=rng), fps=FPS, sound=sound, lossless=True)
+        write_textgrid(alignment, clip.with_suffix(".TextGrid"))
+        clips.append(clip)
+        motions.append(motion)
+    return World(face, tuple(clips), tuple(motions), folder)
