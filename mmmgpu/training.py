@@ -8,7 +8,7 @@ result until the job is done; in memory stay the PCA and model coordinates of th
 import os
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.errors import InputError
 from mmmgpu.flows import best_flow, concatenate, matcher, path_to, shortest_paths
 from mmmgpu.models import Calm, Model
-from mmmgpu.parallel import Cancelled, CancelledError, map_ordered, one_thread_each
+from mmmgpu.parallel import one_thread_each
 from mmmgpu.phonemes import Utterance
 from mmmgpu.phones import SIL
+from mmmgpu.processes import Tick, Work, share_out
 from mmmgpu.progress import progress, progress_bar
 from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordinates
 from mmmgpu.references import check_sound, find_reference, rebase_reference
@@ -144,30 +145,40 @@ class _Training:
 
     def _track(self, reference: Reference) -> tuple[dict[str, Track], dict[str, str]]:
         """Tracks by clip name, and why other clips were skipped; thumbnails are left on disk."""
-        mask = mouth_mask(reference.region)
-
-        def one(clip: Clip, cancelled: Cancelled) -> dict[str, NDArray[Any]]:
-            known = read_step(self.folder, f"track-{clip.path.name}")
-            if known is None:
-                known = _track_and_shrink(clip, reference, mask, cancelled)
-                write_step(self.folder, f"track-{clip.path.name}", known)
-            return known
-
+        shared = (self.folder, reference, mouth_mask(reference.region))
+        self._for_all(_tracking, shared, "track", "track frames", self.corpus)
         tracks, skipped = {}, {}
-        found = map_ordered(one, self.corpus, threads=default_threads())
-        for clip, arrays in zip(
-            self.corpus, progress(found, "track clips", total=len(self.corpus)), strict=True
-        ):
+        for clip in self.corpus:
             name = clip.path.name
+            arrays = _step(self.folder, "track", name)
             if "skipped" in arrays:
                 skipped[name] = str(arrays["skipped"])
                 print(f"warning: skipped: {skipped[name]}", file=sys.stderr)
             else:
-                fields = ("poses", "registered", "correlation", "gain", "offset")
-                tracks[name] = Track(*(arrays[f] for f in fields), float(arrays["residual"]))
+                fields = {f: arrays[f] for f in arrays if f not in ("thumbnails", "residual")}
+                tracks[name] = Track(**fields, residual=float(arrays["residual"]))
         if not tracks:
             raise InputError(next(iter(skipped.values())))
         return tracks, skipped
+
+    def _for_all(
+        self,
+        prepare: Callable[[Any], Work],
+        shared: Any,
+        step: str,
+        label: str,
+        items: Sequence[Any],
+    ) -> None:
+        """Do what `prepare` returns to every item whose step is not yet on disk.
+
+        An item is a clip, or a tuple that begins with one.
+        """
+        clips = [item[0] if isinstance(item, tuple) else item for item in items]
+        done = [read_step(self.folder, f"{step}-{clip.path.name}") is not None for clip in clips]
+        with progress_bar(sum(clip.info.frames for clip in clips), label) as advance:
+            advance(sum(c.info.frames for c, d in zip(clips, done, strict=True) if d))
+            left = [item for item, d in zip(items, done, strict=True) if not d]
+            share_out(prepare, shared, left, processes=default_threads(), advance=advance)
 
     def _choose(self, frames: "_Frames") -> tuple[NDArray[np.int64], int, F32]:
         """Prototype frames, the reference among them, and the PCA coordinates of all frames."""
@@ -205,32 +216,10 @@ class _Training:
 
     def _analyse(self, frames: "_Frames", basis: Basis) -> tuple[list[Floats], list[Floats]]:
         """alpha (T, M - 1) and beta (T, M) of every clip."""
-        analyzer = prepare_analysis(basis, flow=self.options.flow)
-        kernels = get_backend(self.backend, 1)
-        total = sum(clip.info.frames for clip in frames.clips)
-        with progress_bar(total, "analyse frames") as advance:
-
-            def one(clip: Clip, cancelled: Cancelled) -> dict[str, NDArray[Any]]:
-                known = read_step(self.folder, f"analysis-{clip.path.name}")
-                if known is None:
-                    alpha, beta = [], []
-                    for image in crops(clip.path, frames.tracks[clip.path.name], basis.region):
-                        if cancelled():
-                            raise CancelledError
-                        a, b = analyze(analyzer, image, kernels)
-                        alpha.append(a)
-                        beta.append(b)
-                        advance(1)
-                    known = {
-                        "alpha": np.array(alpha, np.float32),
-                        "beta": np.array(beta, np.float32),
-                    }
-                    write_step(self.folder, f"analysis-{clip.path.name}", known)
-                else:
-                    advance(clip.info.frames)
-                return known
-
-            done = list(map_ordered(one, frames.clips, threads=default_threads()))
+        shared = (self.folder, basis, self.options.flow, self.backend)
+        items = [(clip, frames.tracks[clip.path.name]) for clip in frames.clips]
+        self._for_all(_analysing, shared, "analysis", "analyse frames", items)
+        done = [_step(self.folder, "analysis", clip.path.name) for clip in frames.clips]
         return [d["alpha"] for d in done], [d["beta"] for d in done]
 
     def _phonemes(self, frames: "_Frames", coordinates: list[Floats]) -> TrainedStream:
@@ -247,20 +236,50 @@ class _Training:
         return fit_stream(utterances, rng=rng)
 
 
-def _track_and_shrink(
-    clip: Clip, reference: Reference, mask: F32, cancelled: Cancelled
-) -> dict[str, NDArray[Any]]:
-    """The track of a clip and a thumbnail of every frame; or why the clip must be left out."""
-    try:
-        track = track_clip(clip.path, reference)
-    except InputError as e:
-        return {"skipped": np.array(str(e))}
-    small = []
-    for image in crops(clip.path, track, reference.region):
-        if cancelled():
-            raise CancelledError
-        small.append(np.round(thumbnail(image, mask) * 255).astype(np.uint8))
-    return {**vars(track), "residual": np.array(track.residual), "thumbnails": np.array(small)}
+def _step(folder: Path, step: str, name: str) -> dict[str, NDArray[Any]]:
+    """A step that has been done."""
+    arrays = read_step(folder, f"{step}-{name}")
+    assert arrays is not None, (step, name)
+    return arrays
+
+
+def _tracking(shared: tuple[Path, Reference, F32]) -> Work:
+    """Keeps the track of a clip and a thumbnail of every frame; or why it must be left out."""
+    folder, reference, mask = shared
+
+    def work(clip: Clip, tick: Tick) -> None:
+        try:
+            track = track_clip(clip.path, reference)
+        except InputError as e:
+            write_step(folder, f"track-{clip.path.name}", {"skipped": np.array(str(e))})
+            return
+        small = []
+        for image in crops(clip.path, track, reference.region):
+            small.append(np.round(thumbnail(image, mask) * 255).astype(np.uint8))
+            tick()
+        arrays = vars(track) | {"residual": np.array(track.residual)}
+        write_step(folder, f"track-{clip.path.name}", {**arrays, "thumbnails": np.array(small)})
+
+    return work
+
+
+def _analysing(shared: tuple[Path, Basis, str, str]) -> Work:
+    """Keeps alpha and beta of every frame of a clip."""
+    folder, basis, flow, backend = shared
+    analyzer, kernels = prepare_analysis(basis, flow=flow), get_backend(backend, 1)
+
+    def work(item: tuple[Clip, Track], tick: Tick) -> None:
+        clip, track = item
+        alpha, beta = [], []
+        for image in crops(clip.path, track, basis.region):
+            a, b = analyze(analyzer, image, kernels)
+            alpha.append(a)
+            beta.append(b)
+            tick()
+        arrays = {"alpha": np.array(alpha, np.float32), "beta": np.array(beta, np.float32)}
+        write_step(folder, f"analysis-{clip.path.name}", arrays)
+
+    return work
 
 
 @dataclass(frozen=True)
@@ -274,9 +293,7 @@ class _Thumbnails(Sequence[NDArray[np.uint8]]):
         return len(self.clips)
 
     def __getitem__(self, i: Any) -> Any:
-        step = read_step(self.folder, f"track-{self.clips[i].path.name}")
-        assert step is not None
-        return step["thumbnails"]
+        return _step(self.folder, "track", self.clips[i].path.name)["thumbnails"]
 
 
 @dataclass(frozen=True)
