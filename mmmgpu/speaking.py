@@ -28,6 +28,7 @@ from mmmgpu.voices import Speech
 Floats = NDArray[np.float64]
 
 ARTICULATION = (0.5, 1.5)  # least and most
+FAINT = 0.005  # taken off every beta: prototypes that cannot be seen need not be warped
 
 
 def speak(
@@ -82,7 +83,13 @@ def plan(model: Model, alignment: Alignment, *, articulation: float = 1.0) -> Tr
         scale_about(y, neutral, articulation)
         for y, neutral in zip(trajectories(model, labels), silent_mouth(model), strict=True)
     )
-    return Trajectory(tuple(labels), alpha, project_on_simplex(beta), model.fps)
+    return Trajectory(tuple(labels), alpha, _without_faint(project_on_simplex(beta)), model.fps)
+
+
+def _without_faint(beta: Floats) -> Floats:
+    """`beta` (T, M) without its faintest textures; continuous, so that nothing flickers."""
+    kept = np.maximum(beta - FAINT, 0)
+    return np.asarray(kept / kept.sum(axis=1, keepdims=True))
 
 
 def silent_mouth(model: Model) -> tuple[Floats, Floats]:

@@ -84,6 +84,7 @@ def train(
     """
     out = Path(out)
     corpus = open_corpus([Path(c) for c in clips], Path(alignments), sync=options.sync)
+    _check_rates(corpus)
     if options.region is None:
         check_sound(corpus)
     folder = _work_folder(out, corpus, options)
@@ -92,6 +93,16 @@ def train(
     model.save(out)
     shutil.rmtree(folder)
     return model
+
+
+def _check_rates(corpus: Sequence[Clip]) -> None:
+    rate = corpus[0].info.fps
+    for clip in corpus:
+        if abs(clip.info.fps / rate - 1) > 0.001:
+            raise InputError(
+                f"{clip.path}: has {float(clip.info.fps):g} frames/s but {corpus[0].path.name} "
+                f"{float(rate):g}; convert the clips to one rate"
+            )
 
 
 def _work_folder(out: Path, corpus: Sequence[Clip], options: Options) -> Path:
