@@ -1,0 +1,49 @@
+"""``mmmgpu demo``: everything in one go, on the built-in performers."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mmmgpu.commands.options import Backend, Json, LibraryDefault
+from mmmgpu.commands.places import require_output, write_results
+from mmmgpu.commands.summaries import flat, show_table
+
+EXAMPLE = "Example: mmmgpu demo --out demo"
+_DEMO = ("mmmgpu.demo", "make_demo")
+
+
+def demo(
+    *,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for all that is made.")] = Path(
+        "demo"
+    ),
+    seconds: Annotated[
+        float,
+        typer.Option(
+            min=1,
+            help="Length of the corpus that is drawn and learnt.",
+            default_factory=LibraryDefault(*_DEMO, "seconds"),
+        ),
+    ],
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Which performer.", default_factory=LibraryDefault(*_DEMO, "seed")
+        ),
+    ],
+    backend: Backend,
+    json: Json = None,
+) -> None:
+    """Learn a drawn person and let it speak: no video needed.
+
+    The folder then holds the clips, the model, the new sentence as a video with
+    sound, real, reconstructed and spoken side by side, and report.html.
+    """
+    require_output(out / "report.html")
+    require_output(json)
+    from mmmgpu.demo import make_demo
+
+    results = make_demo(out, seed=seed, seconds=seconds, backend=backend)
+    show_table(str(out), flat(results))
+    write_results(results, json)
