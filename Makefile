@@ -31,9 +31,9 @@ install: $(READY)
 
 $(READY): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "make: no Python >= 3.10 found; give one: make PYTHON=/path/to/python"; exit 1; }
-	@"$(PYTHON)" -c "$(NEW_ENOUGH)" || { echo "make: $(PYTHON) is no Python >= 3.10; give another: make PYTHON=/path/to/python"; exit 1; }
+	@"$(PYTHON)" -c "$(NEW_ENOUGH)" 2>/dev/null || { echo "make: $(PYTHON) is no Python >= 3.10; give another: make PYTHON=/path/to/python"; exit 1; }
 	@echo "Setting up $(VENV) (some minutes, once)"
-	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 

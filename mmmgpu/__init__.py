@@ -13,9 +13,12 @@ if TYPE_CHECKING:
     from mmmgpu.alignments import Alignment, Segment, read_alignment
     from mmmgpu.backends import BACKENDS, get_backend
     from mmmgpu.errors import InputError
+    from mmmgpu.evaluation import evaluate
     from mmmgpu.model_files import load
     from mmmgpu.models import Model
     from mmmgpu.operations import blend, distance_scan, fill_holes, forward_warp, sample
+    from mmmgpu.reconstruction import reconstruct
+    from mmmgpu.speaking import speak
     from mmmgpu.training import train
     from mmmgpu.voices import say
 
@@ -31,14 +34,17 @@ __all__ = [
     "align_speech",
     "blend",
     "distance_scan",
+    "evaluate",
     "fill_holes",
     "forward_warp",
     "get_backend",
     "load",
     "performer",
     "read_alignment",
+    "reconstruct",
     "sample",
     "say",
+    "speak",
     "train",
 ]
 
@@ -47,10 +53,13 @@ _HOMES = {
     "alignments": ["Alignment", "Segment", "read_alignment"],
     "backends": ["BACKENDS", "get_backend"],
     "errors": ["InputError"],
+    "evaluation": ["evaluate"],
     "model_files": ["load"],
     "models": ["Model"],
     "operations": ["blend", "distance_scan", "fill_holes", "forward_warp", "sample"],
     "performer": [],  # the module itself
+    "reconstruction": ["reconstruct"],
+    "speaking": ["speak"],
     "training": ["train"],
     "voices": ["say"],
 }

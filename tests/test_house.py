@@ -28,7 +28,7 @@ ELSEWHERE = re.compile(  # a folder of one machine, an address, a name in a priv
 )
 
 # Tests that mirror no module: they hold for several, or for all.
-TOPICS = {"api", "house", "kernel_twins", "no_vacuous_tests", "packaging"}
+TOPICS = {"api", "house", "kernel_twins", "no_vacuous_tests", "packaging", "real"}
 
 # cli -> domain -> arrays, backends -> kernels: a module may import its own layer and those below.
 LAYERS = {
@@ -37,6 +37,7 @@ LAYERS = {
     "mmmgpu.arrays": 1,
     "mmmgpu.backends": 1,
     "mmmgpu.cli": 3,
+    "mmmgpu.commands": 3,
     "mmmgpu.__main__": 3,
 }
 DOMAIN = 2  # every other module
@@ -163,6 +164,13 @@ def test_nothing_imports_upward(path):
 def test_an_import_upward_is_seen(name, source, monkeypatch):
     monkeypatch.setitem(globals(), "NAMES", {*NAMES, "mmmgpu.cli"})
     assert list(upward(source, name))
+
+
+def test_every_package_is_installed():
+    project = (ROOT / "pyproject.toml").read_text()
+    listed = re.search(r"^packages = \[(.*)\]$", project, re.MULTILINE).group(1)
+    packages = {module_name(path) for path in MODULES if path.name == "__init__.py"}
+    assert set(re.findall(r"[\w.]+", listed)) == packages
 
 
 def test_every_library_is_a_stated_dependency():
