@@ -6,7 +6,8 @@ not.
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -119,3 +120,17 @@ def path_to(target: int, before: NDArray[np.int64]) -> list[int]:
     while before[path[-1]] >= 0:
         path.append(int(before[path[-1]]))
     return path[::-1]
+
+
+def extend_flows(
+    flows: dict[int, F32], path: Sequence[int], images: Mapping[int, F32], match: Matcher
+) -> None:
+    """Add the flows from the first frame of `path` to all its frames that `flows` lacks.
+
+    They are concatenated step by step; paths of one tree share their steps.
+    """
+    h, w = images[path[0]].shape[:2]
+    flows.setdefault(path[0], np.zeros((h, w, 2), np.float32))
+    for a, b in pairwise(path):
+        if b not in flows:
+            flows[b] = concatenate(flows[a], match(images[a], images[b]))

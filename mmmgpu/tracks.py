@@ -162,11 +162,6 @@ def crops(path: Path, track: Track, region: Region) -> Iterator[F32]:
         yield crop(frame, pose, track, region)
 
 
-def crop_at(path: Path, track: Track, region: Region, t: int) -> F32:
-    """The region of frame `t` of a clip."""
-    return crop(frame_at(path, t), track.poses[t], track, region)
-
-
 def frame_at(path: Path, t: int) -> NDArray[np.uint8]:
     """Frame `t` of the clip at `path`, (H, W, 3) uint8."""
     return next(iter(read_frames(path, start=t, stop=t + 1)))

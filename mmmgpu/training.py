@@ -22,7 +22,7 @@ from mmmgpu.basis import Basis, make_basis
 from mmmgpu.checkpoints import fingerprint, open_checkpoints, read_step, write_step
 from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.errors import InputError
-from mmmgpu.flows import best_flow, concatenate, matcher, path_to, shortest_paths
+from mmmgpu.flows import best_flow, extend_flows, matcher, path_to, shortest_paths
 from mmmgpu.models import Calm, Model
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phonemes import Utterance
@@ -31,9 +31,10 @@ from mmmgpu.processes import Tick, Work, share_out
 from mmmgpu.progress import progress, progress_bar
 from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordinates
 from mmmgpu.references import check_sound, find_reference, rebase_reference
-from mmmgpu.regions import mouth_mask
-from mmmgpu.tracks import Reference, Track, crop_at, crops, frame_at, rebase, track_clip
+from mmmgpu.regions import Region, mouth_mask
+from mmmgpu.tracks import Reference, Track, crop, crops, frame_at, rebase, track_clip
 from mmmgpu.trajectory_training import TrainedStream, fit_stream
+from mmmgpu.videos import read_frames
 
 Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -139,7 +140,8 @@ class _Training:
         frames = _Frames(used, rebased)
         basis = self._basis(frames, reference, chosen, reference_frame, coordinates)
         alphas, betas = self._analyse(frames, basis)
-        alpha, beta = self._phonemes(frames, alphas), self._phonemes(frames, betas)
+        alpha = self._phonemes(frames, "alpha", alphas)
+        beta = self._phonemes(frames, "beta", betas)
         places = [frames.find(int(i)) for i in chosen]
         calm = _calmest(used, rebased, reference)
         return Model(
@@ -211,16 +213,19 @@ class _Training:
         coordinates: F32,
     ) -> Basis:
         """Prototypes with their flows: direct, or along the path of similar frames."""
-        region = reference.region
-        images = {int(i): frames.crop(int(i), region) for i in chosen}
-        mask, match = mouth_mask(region), matcher(self.options.flow)
+        region, match = reference.region, matcher(self.options.flow)
+        mask = mouth_mask(region)
         before = shortest_paths(coordinates, reference_frame)
-        origin = images[reference_frame]
-        flows = []
-        for i in progress(chosen, "prototype flows"):
-            path = path_to(int(i), before)
-            via = [frames.walk(path[:-1], region, match)] if len(path) > 2 else []
-            flows.append(best_flow(origin, images[int(i)], mask, via, match))
+        paths = {int(i): path_to(int(i), before) for i in chosen}
+        images = frames.crops(sorted({i for path in paths.values() for i in path}), region)
+        origin, flows = images[reference_frame], []
+        walked: dict[int, F32] = {}
+        for i, path in progress(list(paths.items()), "prototype flows"):
+            via = []
+            if len(path) > 2:
+                extend_flows(walked, path[:-1], images, match)
+                via.append((images[path[-2]], walked[path[-2]]))
+            flows.append(best_flow(origin, images[i], mask, via, match))
         stacked = np.stack([images[int(i)] for i in chosen])
         place = int(np.flatnonzero(chosen == reference_frame)[0])
         return make_basis(stacked, np.stack(flows), place, region)
@@ -233,18 +238,16 @@ class _Training:
         done = [_step(self.folder, "analysis", clip.path.name) for clip in frames.clips]
         return [d["alpha"] for d in done], [d["beta"] for d in done]
 
-    def _phonemes(self, frames: "_Frames", coordinates: list[Floats]) -> TrainedStream:
-        """The phoneme models of one stream."""
-        utterances = [
-            Utterance(
-                z[good].astype(np.float64),
-                [label for label, g in zip(clip.labels, good, strict=True) if g],
-            )
-            for clip, z in zip(frames.clips, coordinates, strict=True)
-            for good in [frames.tracks[clip.path.name].registered]
-        ]
+    def _phonemes(self, frames: "_Frames", name: str, coordinates: list[Floats]) -> TrainedStream:
+        """The phoneme models of one stream, from the frames whose head was found."""
+        utterances = []
+        for clip, z in zip(frames.clips, coordinates, strict=True):
+            good = np.flatnonzero(frames.tracks[clip.path.name].registered)
+            labels = clip.labels
+            utterances.append(Utterance(z[good].astype(np.float64), [labels[t] for t in good]))
         rng = np.random.default_rng(self.options.seed)
-        return fit_stream(utterances, rng=rng)
+        with progress_bar(None, f"train {name}") as advance:
+            return fit_stream(utterances, rng=rng, progress=lambda done, total: advance(1))
 
 
 def _step(folder: Path, step: str, name: str) -> dict[str, NDArray[Any]]:
@@ -326,19 +329,19 @@ class _Frames:
             i -= clip.info.frames
         raise IndexError(i)
 
-    def crop(self, i: int, region: Any) -> F32:
-        clip, t = self.find(i)
-        return crop_at(clip.path, self.tracks[clip.path.name], region, t)
-
-    def walk(self, path: Sequence[int], region: Any, match: Any) -> tuple[F32, F32]:
-        """(last image, flow first -> last) along `path`, concatenated step by step."""
-        image = self.crop(path[0], region)
-        flow = np.zeros((*image.shape[:2], 2), np.float32)
-        for i in path[1:]:
-            following = self.crop(i, region)
-            flow = concatenate(flow, match(image, following))
-            image = following
-        return image, flow
+    def crops(self, numbers: Sequence[int], region: Region) -> dict[int, F32]:
+        """The regions of some frames, each clip read once; `numbers` is sorted."""
+        found, first = {}, 0
+        for clip in self.clips:
+            wanted = {i - first for i in numbers if first <= i < first + clip.info.frames}
+            if wanted:
+                track = self.tracks[clip.path.name]
+                frames = read_frames(clip.path, stop=max(wanted) + 1)
+                for t, frame in enumerate(frames):
+                    if t in wanted:
+                        found[first + t] = crop(frame, track.poses[t], track, region)
+            first += clip.info.frames
+        return found
 
 
 def _calmest(clips: Sequence[Clip], tracks: Mapping[str, Track], reference: Reference) -> Clip:
