@@ -64,6 +64,7 @@ def _start(
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, **ONE_THREAD},
+        start_new_session=True,  # Ctrl-C is the parent's business, which ends its children
     )
     assert child.stdin is not None
     try:
@@ -97,8 +98,8 @@ def main() -> None:
     """Do what the parent says on standard input."""
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # whatever a library prints must not pass for an answer
-    prepare, shared, items = pickle.load(sys.stdin.buffer)
     try:
+        prepare, shared, items = pickle.load(sys.stdin.buffer)
         from mmmgpu.parallel import one_thread_each
 
         with one_thread_each():
@@ -107,8 +108,8 @@ def main() -> None:
                 work(item, lambda: answers.write(DONE) and None)
     except InputError as e:
         answers.write(FAILED + str(e).encode())
-    except KeyboardInterrupt:
-        sys.exit(130)
+    except (BrokenPipeError, EOFError, pickle.UnpicklingError):
+        sys.exit(1)  # the parent is gone
 
 
 if __name__ == "__main__":
