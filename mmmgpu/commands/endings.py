@@ -25,7 +25,7 @@ INTERRUPTED_LINE = (
     b"mmmgpu: interrupted; no half-written file is left, what is finished is kept, "
     b"and the same command continues after it\n"
 )
-GRACE = 1.5  # s, that an interrupted command has for putting its things in order
+GRACE = 1.0  # s, that an interrupted command has for putting its things in order
 
 
 def say(message: str) -> None:
