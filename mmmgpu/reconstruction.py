@@ -14,7 +14,7 @@ from mmmgpu.compositing import composite
 from mmmgpu.models import Model
 from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.progress import progress
-from mmmgpu.sounds import read_sound
+from mmmgpu.sounds import check_sync, read_sound
 from mmmgpu.synthesis import synthesize_one
 from mmmgpu.tracks import Track, crop, track_clip
 from mmmgpu.video_writing import write_video
@@ -73,14 +73,17 @@ def reconstruct(
         backend: A name for `mmmgpu.backends.get_backend`.
 
     Raises:
-        InputError: The clip cannot be read or registered, or `out` not be written.
+        InputError: The clip cannot be read or registered, its sound is of another length, or `out`
+            cannot be written.
     """
     clip = Path(clip)
     info = probe(clip, minimum_frames=2)
     with one_thread_each():
+        sound = read_sound(clip, mono=False) if info.has_sound else None
+        if sound is not None:
+            check_sync(info, sound)
         analysed = analyse_clip(model, clip, backend=backend)
         frames = reconstructed_frames(model, clip, analysed, backend=backend)
-        sound = read_sound(clip, mono=False) if info.has_sound else None
         write_video(out, frames, fps=info.fps, sound=sound, lossless=lossless)
     return analysed
 
