@@ -1,0 +1,407 @@
+"""What a model has learned, and how well, as one HTML file that needs no other file.
+
+Pictures and small videos lie inside it. It reads well on a phone, in the light and in the dark, and
+says in plain words what every picture shows.
+"""
+
+import base64
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.backends import get_backend
+from mmmgpu.figures import (
+    Panel,
+    curves,
+    enlarged,
+    flow_arrows,
+    jpeg_uri,
+    learning_curve,
+    outlined,
+    seen_through,
+    to_bytes,
+)
+from mmmgpu.files import write_text
+from mmmgpu.models import Model, project_on_simplex, trajectories
+from mmmgpu.parallel import one_thread_each
+from mmmgpu.phones import SIL, VISEMES, arpabet
+from mmmgpu.report_tables import error_table, fact_table, lip_table, picture_table
+from mmmgpu.synthesis import synthesize_one
+from mmmgpu.trajectory_files import Trajectory
+
+Floats = NDArray[np.float64]
+
+LARGEST_VIDEO = 4_000_000  # bytes of a video that is put into the report; larger ones are linked
+LARGEST_TILE = 150  # [px] height of a small picture
+FLOWS_SHOWN, CHANGES_SHOWN, STILLS_SHOWN = 6, 8, 12
+OUTLINES = (("w_f", (255, 210, 60)), ("w_t", (90, 200, 255)), ("cover", (255, 255, 255)))
+
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+:root {{ color-scheme: light dark; --line: #8885; --back: #8881; }}
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 0 auto; padding: 1rem; }}
+h1 {{ font-size: 1.6rem; }} h2 {{ font-size: 1.25rem; margin-top: 2.5rem; }}
+figure {{ margin: 1rem 0; }} figcaption {{ font-size: .85rem; opacity: .85; }}
+img, video {{ max-width: 100%; height: auto; border-radius: 4px; display: block; }}
+.tiles {{ display: grid; gap: .6rem; grid-template-columns: repeat(auto-fill, minmax(92px, 1fr)); }}
+.tiles.wide {{ grid-template-columns: repeat(auto-fill, minmax(200px, 1fr)); }}
+.tiles figure {{ margin: 0; }} .tiles img {{ width: 100%; }}
+.tiles figcaption {{ text-align: center; font-size: .75rem; }}
+.pair {{ display: flex; gap: 2px; }} .pair img {{ width: 50%; }}
+.chosen img {{ outline: 3px solid #d9730d; }}
+.scroll {{ overflow-x: auto; }} .scroll svg {{ min-width: 680px; width: 100%; height: auto; }}
+.small svg {{ max-width: 34rem; width: 100%; height: auto; }}
+table {{ border-collapse: collapse; font-size: .9rem; }}
+th, td {{ padding: .3rem .7rem; border-bottom: 1px solid var(--line); text-align: left; }}
+td.n, th.n {{ text-align: right; font-variant-numeric: tabular-nums; }}
+.better {{ font-weight: 600; }}
+</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+
+
+def write_report(
+    model: Model,
+    path: str | os.PathLike[str],
+    *,
+    evaluation: Mapping[str, Any] | None = None,
+    held_out: Trajectory | None = None,
+    spoken: Trajectory | None = None,
+    videos: Mapping[str, Path] | None = None,
+    backend: str = "warp",
+) -> None:
+    """Write the report on `model` to `path`, an HTML file.
+
+    Args:
+        model: Any model, of a real person too.
+        path: ``.html``.
+        evaluation: What `evaluation.evaluate` returned; under the key ``reconstruction`` it may
+            also hold a list of what `evaluation.measure_reconstruction` returned.
+        held_out: A real clip that the model was not trained on, analysed, with its phones.
+        spoken: What `speaking.speak` returned.
+        videos: Captions and the videos they describe.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    with one_thread_each():
+        sections = [
+            _summary(model),
+            _videos(videos or {}, Path(path)),
+            _reference(model),
+            _prototypes(model),
+            _flows(model),
+            _visemes(model, backend),
+            _training(model, backend),
+            _movement(model, held_out) if held_out else "",
+            _errors(evaluation) if evaluation else "",
+            _stills(model, spoken, backend) if spoken else "",
+        ]
+    body = "\n".join(section for section in sections if section)
+    write_text(path, PAGE.format(title="A learned mouth: report", body=body))
+
+
+def _summary(model: Model) -> str:
+    notes, fps = model.notes, float(model.fps)
+    skipped = notes.get("skipped", {})
+    frames = notes.get("frames", 0)
+    facts = {
+        "clips learned from": str(len(notes.get("clips", []))),
+        "frames": f"{frames} ({frames / fps:.0f} s at {fps:g} a second)",
+        "size of the picture": "{} x {} pixels".format(*model.frame_size),
+        "prototypes": str(len(model.basis.images)),
+        "phones": str(len(model.alpha.trained.labels)),
+        "frames without a head": str(notes.get("unregistered_frames", 0)),
+        "unrest of the registration": f"{notes.get('registration_residual_px', 0):.2f} pixels",
+        "sound moved by": f"{notes.get('sync_s', 0):+.3f} s",
+        "clips skipped": str(len(skipped)),
+    }
+    text = (
+        "<h1>A learned mouth</h1>\n"
+        "<p>A mouth was learned from video: how it looks, and how it moves with each speech sound "
+        "(phone). This page shows what was found, step by step, and how far the result is from "
+        "the real thing.</p>\n" + fact_table(facts)
+    )
+    if skipped:
+        rows = "".join(
+            f"<li><b>{escape(name)}</b>: {escape(why)}</li>" for name, why in skipped.items()
+        )
+        text += f"<p>Skipped, and why:</p><ul>{rows}</ul>"
+    return text + (
+        "<p>The unrest of the registration is how far the measured head position jumps about from "
+        "frame to frame; it is smoothed away before anything is learned. Below a pixel is good.</p>"
+    )
+
+
+def _videos(videos: Mapping[str, Path], page: Path) -> str:
+    if not videos:
+        return ""
+    return "<h2>Videos</h2>" + "".join(_video(c, v, page) for c, v in videos.items())
+
+
+def _video(caption: str, path: Path, page: Path) -> str:
+    link = escape(Path(os.path.relpath(path, page.parent)).as_posix())
+    text = f'<figcaption>{escape(caption)} (<a href="{link}">{escape(path.name)}</a>)</figcaption>'
+    data = path.read_bytes()
+    if len(data) > LARGEST_VIDEO or path.suffix.lower() != ".mp4":
+        return f"<figure>{text}</figure>"
+    address = "data:video/mp4;base64," + base64.b64encode(data).decode()
+    player = f'<video controls playsinline src="{address}" aria-label="{escape(caption)}"></video>'
+    return f"<figure>{player}{text}</figure>"
+
+
+def _reference(model: Model) -> str:
+    basis = model.basis
+    frame = model.prototype_frames[basis.reference]
+    masks = [(getattr(basis, name), colour) for name, colour in OUTLINES]
+    scale = 2 if frame.shape[0] <= 400 else 1
+    picture = outlined(frame, masks, basis.region.box[:2], scale=scale)
+    image = basis.images[basis.reference]
+    words = ("flows are compared here", "textures are compared here", "this much is put on a video")
+    parts = [
+        _tile(seen_through(image, mask), f"{name}: {use}")
+        for (mask, _), (name, _), use in zip(masks, OUTLINES, words, strict=True)
+    ]
+    name, t = model.sources[basis.reference]
+    return (
+        "<h2>The reference</h2><p>One calm frame is the reference "
+        f"(frame {t} of {escape(name)}): every other mouth is described as this one moved. "
+        "The masks, found from picture and sound alone, say where.</p>"
+        + _figure(picture, "The reference with the half-way lines of the lip mask w_f (yellow), "
+                  "the mouth mask w_t (blue) and the cover (white).")
+        + f'<div class="tiles wide">{"".join(parts)}</div>'
+    )  # fmt: skip
+
+
+def _prototypes(model: Model) -> str:
+    tiles = "".join(
+        _tile(
+            image,
+            f"{i}" + (" (reference)" if i == model.basis.reference else ""),
+            alt=f"prototype {i}: frame {t} of {name}",
+            marked=i == model.basis.reference,
+        )
+        for i, (image, (name, t)) in enumerate(zip(model.basis.images, model.sources, strict=True))
+    )
+    return (
+        "<h2>All prototypes</h2><p>Real frames chosen so that together they show all that this "
+        f"mouth does. Everything the model shows is mixed from these.</p><div class='tiles'>{tiles}"
+        "</div>"
+    )
+
+
+def _flows(model: Model) -> str:
+    basis = model.basis
+    moved = np.sqrt((basis.flows**2).sum(axis=-1) * basis.w_f).mean(axis=(1, 2))
+    height = basis.region.shape[0]
+    scale = max(1, round(320 / height))
+    tiles = "".join(
+        f'<figure><div class="pair">{_img(drawn, f"arrows of flow {i}")}'
+        f"{_img(enlarged(basis.images[i], scale), f'prototype {i}')}</div>"
+        f"<figcaption>to prototype {i}</figcaption></figure>"
+        for i in np.argsort(-moved)[:FLOWS_SHOWN]
+        for drawn in [
+            flow_arrows(
+                basis.images[basis.reference],
+                basis.flows[i],
+                scale=scale,
+                step=max(5, height // 18),
+            )
+        ]
+    )
+    return (
+        "<h2>Flows</h2><p>A flow says where each point of the reference has gone in a prototype: "
+        "an arrow begins at the point in the reference and ends where it is in the prototype on "
+        f"the right. Here are the largest.</p><div class='tiles wide'>{tiles}</div>"
+    )
+
+
+def _visemes(model: Model, backend: str) -> str:
+    tiles = "".join(
+        _tile(
+            image,
+            f"{label} · {count}",
+            alt=f"the mouth in the middle of {label}, learned from {count} frames",
+        )
+        for label, count, image in _means(model, backend)
+    )
+    return (
+        "<h2>The mouth of each phone</h2><p>The trained mean of every phone, as the model draws "
+        "it, with the number of frames it was learned from; phones that look alike stand "
+        f"together.</p><div class='tiles'>{tiles}</div>"
+    )
+
+
+def _means(model: Model, backend: str) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
+    """Every phone with its frames and its mean as a picture, in order of viseme classes."""
+    order = [label for labels in VISEMES.values() for label in labels]
+    known = model.alpha.trained.labels
+    for label in sorted(known, key=lambda p: _place(p, order)):
+        count = int(model.alpha.trained.count[known.index(label)])
+        yield label, count, _mean_picture(model, label, backend, trained=True)
+
+
+def _place(label: str, order: Sequence[str]) -> tuple[int, str]:
+    phone = arpabet(label)
+    return (order.index(phone) if phone in order else len(order)), label
+
+
+def _mean_picture(model: Model, label: str, backend: str, *, trained: bool) -> NDArray[np.float32]:
+    alpha, beta = (
+        (stream.trained if trained else stream.pooled).mean[stream.trained.labels.index(label)]
+        for stream in (model.alpha, model.beta)
+    )
+    return synthesize_one(
+        model.basis, alpha, project_on_simplex(beta[None])[0], get_backend(backend)
+    )
+
+
+def _training(model: Model, backend: str) -> str:
+    alpha = model.alpha
+    change = np.linalg.norm(alpha.trained.mean - alpha.pooled.mean, axis=1)
+    labels = [alpha.trained.labels[i] for i in np.argsort(-change)[:CHANGES_SHOWN]]
+    pairs = "".join(
+        f'<figure><div class="pair">{_img(_tile_sized(before), f"{label} before training")}'
+        f"{_img(_tile_sized(after), f'{label} after training')}</div>"
+        f"<figcaption>{escape(label)}: before, after</figcaption></figure>"
+        for label in labels
+        for before in [_mean_picture(model, label, backend, trained=False)]
+        for after in [_mean_picture(model, label, backend, trained=True)]
+    )
+    errors = {
+        f"{name} (clips learned from)": stream.history.training.sum(axis=1)
+        for name, stream in (("alpha, movement", alpha), ("beta, texture", model.beta))
+    }
+    constants = "; ".join(
+        f"{name}: smoothness {c.smoothness:g}, order {c.order}, ridge {c.ridge:g}, "
+        f"{c.iterations} iterations"
+        for name, c in (("alpha", alpha.constants), ("beta", model.beta.constants))
+    )
+    return (
+        "<h2>What training changed</h2><p>Plain averages over the frames of a phone make a lazy "
+        "mouth: while one phone is said, the mouth is on its way to the next. Training moves the "
+        "means until the whole movement fits. These phones were moved most.</p>"
+        f"<div class='tiles wide'>{pairs}</div>"
+        f'<figure class="small">{learning_curve(errors)}<figcaption>The squared error of the '
+        "movement made from the phones, on the clips learned from, as training goes on. Constants "
+        f"chosen by cross-validation inside these clips: {constants}.</figcaption></figure>"
+    )
+
+
+def _movement(model: Model, held_out: Trajectory) -> str:
+    made = {
+        name: trajectories(model, held_out.labels, trained=name == "after training")
+        for name in ("before training", "after training")
+    }
+    panels = []
+    for stream, name in enumerate(("alpha", "beta")):
+        real = (held_out.alpha, held_out.beta)[stream]
+        numbers = model.basis.moving if name == "alpha" else np.arange(real.shape[1])
+        for j in np.argsort(-real.var(axis=0))[:2]:
+            shown = {"real": real[:, j], **{kind: y[stream][:, j] for kind, y in made.items()}}
+            panels.append(Panel(f"{name} of prototype {numbers[j]}", shown))
+    alphas = {"real": held_out.alpha, **{kind: y[0] for kind, y in made.items()}}
+    opening = {kind: _opening(model, alpha) for kind, alpha in alphas.items()}
+    panels.insert(0, Panel("lips apart [px]", opening))
+    drawing = curves(panels, held_out.labels, float(held_out.fps))
+    return (
+        "<h2>Movement of a sentence that was not learned</h2><p>Grey: what the mouth really did, "
+        "in the model's coordinates. Dashed orange: made from the phones before training. Blue: "
+        "after training. Alpha says how far the mouth is moved towards a prototype, beta how much "
+        "of its texture is mixed in; the two that move most of each are shown. Silence is shaded."
+        f'</p><figure class="scroll">{drawing}<figcaption>Top: how much further the lips are '
+        "apart than in the reference, by the model's own flow.</figcaption></figure>"
+    )
+
+
+def _opening(model: Model, alpha: Floats) -> Floats:
+    """How much further apart than in the reference the lips are [px], (T, M - 1) -> (T,).
+
+    Measured below each other in the middle of the mouth, at the row that the prototypes move most
+    and at the row within a mouth's width above it that they move most the other way.
+    """
+    basis = model.basis
+    x, _, width = basis.region.mouth
+    column = np.clip(round(x - basis.region.box[0]), 0, basis.region.shape[1] - 1)
+    down = basis.flows[basis.moving][:, :, column, 1].astype(np.float64) * basis.w_f[:, column]
+    lower = int(np.argmax((down**2).mean(axis=0)))
+    above = slice(max(0, lower - round(width)), lower + 1)
+    apart = ((down[:, lower : lower + 1] - down[:, above]) ** 2).mean(axis=0)
+    upper = above.start + int(np.argmax(apart))
+    return np.asarray(alpha @ (down[:, lower] - down[:, upper]))
+
+
+def _errors(evaluation: Mapping[str, Any]) -> str:
+    text = (
+        "<h2>Errors</h2><p>The model against clips that it was not trained on: "
+        f"{escape(', '.join(evaluation['clips']))}. Intervals are 95 % over clips.</p>"
+        + error_table(evaluation)
+    )
+    if "lips" in evaluation:
+        text += lip_table(evaluation["lips"])
+    if evaluation.get("reconstruction"):
+        text += picture_table(evaluation["reconstruction"])
+    return text
+
+
+def _stills(model: Model, spoken: Trajectory, backend: str) -> str:
+    """Frames in the middle of phones of what was spoken, evenly chosen."""
+    middles = _middles(spoken.labels)
+    chosen = [
+        middles[i] for i in np.unique(np.linspace(0, len(middles) - 1, STILLS_SHOWN, dtype=int))
+    ]
+    kernels = get_backend(backend)
+    tiles = "".join(
+        _tile(
+            synthesize_one(model.basis, spoken.alpha[t], spoken.beta[t], kernels),
+            f"{spoken.labels[t]} {float(t / spoken.fps):.2f} s",
+        )
+        for t in chosen
+    )
+    return (
+        "<h2>Speaking</h2><p>The mouth of the new sentence in the middle of some of its phones."
+        f"</p><div class='tiles'>{tiles}</div>"
+    )
+
+
+def _middles(labels: Sequence[str]) -> list[int]:
+    """The middle frame of every run of one phone that is no silence; all runs, if all are."""
+    starts = [t for t, label in enumerate(labels) if t == 0 or label != labels[t - 1]]
+    runs = list(zip(starts, [*starts[1:], len(labels)], strict=True))
+    said = [(a, b) for a, b in runs if labels[a] != SIL] or runs
+    return [(a + b) // 2 for a, b in said]
+
+
+def _tile_sized(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """At most `LARGEST_TILE` pixels high."""
+    share = LARGEST_TILE / image.shape[0]
+    return enlarged(image, share) if share < 1 else to_bytes(image)
+
+
+def _tile(image: NDArray[Any], caption: str, *, alt: str = "", marked: bool = False) -> str:
+    kind = ' class="chosen"' if marked else ""
+    shown = _img(_tile_sized(image), alt or caption)
+    return f"<figure{kind}>{shown}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _figure(image: NDArray[Any], caption: str) -> str:
+    return f"<figure>{_img(image, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _img(image: NDArray[Any], alt: str) -> str:
+    return f'<img src="{jpeg_uri(image)}" alt="{escape(alt)}">'
