@@ -34,7 +34,7 @@ def open_corpus(paths: Sequence[Path], alignments: Path, *, sync: float = 0.0) -
     """Look at every clip and its alignment.
 
     Args:
-        paths: Video files of one person, with different names.
+        paths: Video files of one person, with different names, of one size.
         alignments: Folder with a TextGrid, .align or .lab for every clip, or one such file.
         sync: [s] by which sound and alignment are moved against the picture; negative: earlier.
 
@@ -47,7 +47,18 @@ def open_corpus(paths: Sequence[Path], alignments: Path, *, sync: float = 0.0) -
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
         raise InputError(f"{double[0]}: two clips have this name; rename one of them")
-    return [_open_clip(path, alignments, sync) for path in paths]
+    corpus = [_open_clip(path, alignments, sync) for path in paths]
+    for clip in corpus[1:]:
+        _check_size(corpus[0].info, clip.info)
+    return corpus
+
+
+def _check_size(first: VideoInfo, other: VideoInfo) -> None:
+    if (other.width, other.height) != (first.width, first.height):
+        raise InputError(
+            f"{other.path}: is {other.width} x {other.height}, {first.path} is "
+            f"{first.width} x {first.height}; give clips of one size"
+        )
 
 
 def _open_clip(path: Path, alignments: Path, sync: float) -> Clip:

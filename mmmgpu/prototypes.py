@@ -14,6 +14,7 @@ from mmmgpu.errors import InputError
 Floats = NDArray[np.float64]
 
 COMPONENTS = 15
+LEAST_VARIANCE = 1e-9  # of the first component's: less is rounding, not to be whitened
 
 
 def principal_coordinates(thumbnails: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
@@ -29,7 +30,9 @@ def principal_coordinates(thumbnails: Sequence[NDArray[np.uint8]]) -> NDArray[np
     pca = IncrementalPCA(components, whiten=True)
     for batch in _batches(thumbnails, components):
         pca.partial_fit(batch)
-    parts = [pca.transform(np.asarray(t, np.float64)) for t in thumbnails if len(t)]
+    variance = pca.explained_variance_
+    real = max(1, int((variance > LEAST_VARIANCE * variance[0]).sum()))
+    parts = [pca.transform(np.asarray(t, np.float64))[:, :real] for t in thumbnails if len(t)]
     return np.concatenate(parts).astype(np.float32)
 
 

@@ -1,4 +1,5 @@
 import pytest
+from worlds import make_world
 
 from mmmgpu.backends import BACKENDS, get_backend
 
@@ -21,3 +22,9 @@ def backend(request):
     """
     get_backend(request.param)
     return request.param
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory):
+    """A drawn person in a few short clips with sound and alignments; see `worlds`."""
+    return make_world(tmp_path_factory.mktemp("world"))

@@ -51,11 +51,11 @@ def test_tracks_follow_the_head(world, tracks):
             for t, pose in enumerate(track.poses)
             if world.motions[i].blink[t] == world.motions[0].blink[0]
         ]
-        moved = np.linalg.norm(true_points(world, i, len(track) - 1) - start, axis=1).mean()
+        still = [np.linalg.norm(start - true_points(world, i, t)) for t in range(len(track))]
         assert np.mean(miss) < 0.35
         assert np.max(miss) < 1.0
         assert track.residual < 0.3
-        assert moved > 0.5 or i == 0  # there was something to follow
+        assert max(still) / len(start) ** 0.5 > 3 * np.mean(miss)  # there was something to follow
 
 
 def test_the_same_camera_has_the_same_exposure(tracks):
@@ -77,7 +77,7 @@ def exposed(frames, gain, offset):
     ids=["exposure", "white balance"],
 )
 def test_exposure_and_white_balance_are_recovered(world, reference, tmp_path, gain, offset):
-    frames = [frame_at(world.clips[0], t) for t in range(0, 24, 3)]
+    frames = [frame_at(world.clips[0], t) for t in range(8)]
     clip = tmp_path / "other camera.mkv"
     seen = exposed(frames, np.array(gain), np.array(offset))
     write_video(clip, seen, fps=FPS, lossless=True)
@@ -87,7 +87,7 @@ def test_exposure_and_white_balance_are_recovered(world, reference, tmp_path, ga
     np.testing.assert_allclose(track.gain * darkened + track.offset, skin, atol=0.01)
     plain = track_clip(world.clips[0], reference)
     pictures = [
-        crop(frame, plain.poses[3 * i], plain, reference.region) for i, frame in enumerate(frames)
+        crop(frame, plain.poses[i], plain, reference.region) for i, frame in enumerate(frames)
     ]
     for a, b in zip(crops(clip, track, reference.region), pictures, strict=True):
         assert np.sqrt(np.mean((a - b) ** 2)) < 0.03

@@ -1,8 +1,9 @@
-"""Small worlds for tests: a drawn person saying a few phones, as clips with sound and alignments."""
+"""Small worlds for tests: a drawn person who says a few phones, in clips with sound."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from mmmgpu.alignments import Alignment, Segment, cover, write_textgrid
@@ -33,6 +34,13 @@ class World:
     alignments: Path
 
 
+def texture(height, width, *, grain=2.0, seed=0):
+    """A smooth random RGB picture (H, W, 3) in [0, 1]; `grain` is the size of its spots [px]."""
+    noise = np.random.default_rng(seed).random((height, width, 3)).astype(np.float32)
+    soft = cv2.GaussianBlur(noise, (0, 0), grain)
+    return (soft - soft.min()) / (soft.max() - soft.min())
+
+
 def say(sentence, *, phone=0.15, silence=0.3):
     """The phones of `sentence` with silence about them."""
     labels = sentence.split()
@@ -52,6 +60,12 @@ def voice(alignment, rng):
     return np.clip(samples, -1, 1).astype(np.float32)
 
 
+def sentence_motion(face, alignment, rng):
+    """How `face` says `alignment`, with head motion and blinks."""
+    frames = round(alignment.duration * FPS)
+    return articulate(face, alignment.phones, frames, FPS, rng)
+
+
 def make_world(folder, *, seed=5, size=(160, 144), sentences=SENTENCES):
     """Render `sentences` into `folder`, losslessly, with camera noise and head motion."""
     face = performer(seed, size=size)
@@ -59,7 +73,7 @@ def make_world(folder, *, seed=5, size=(160, 144), sentences=SENTENCES):
     for i, sentence in enumerate(sentences):
         rng = np.random.default_rng([seed, i])
         alignment = say(sentence)
-        motion = articulate(face, alignment.phones, round(alignment.duration * FPS), FPS, rng)
+        motion = sentence_motion(face, alignment, rng)
         clip = folder / f"clip {i}.mkv"
         sound = (voice(alignment, rng), RATE)
         write_video(clip, render(face, motion, rng=rng), fps=FPS, sound=sound, lossless=True)
