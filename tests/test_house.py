@@ -166,6 +166,15 @@ def test_an_import_upward_is_seen(name, source, monkeypatch):
     assert list(upward(source, name))
 
 
+@pytest.mark.parametrize("path", cases([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]))
+def test_documents_name_files_that_exist(path):
+    text = path.read_text()
+    links = [path.parent / link for link in re.findall(r"\]\((?!https?:)([^)#]+)", text)]
+    own = r"`((?:bench|docs|kernels|mmmgpu|tests)/(?![^`]*NAME)[\w/]+\.\w+)`"
+    files = [ROOT / name for name in re.findall(own, text)]
+    assert [str(file) for file in (*links, *files) if not file.exists()] == []
+
+
 def test_every_package_is_installed():
     project = (ROOT / "pyproject.toml").read_text()
     listed = re.search(r"^packages = \[(.*)\]$", project, re.MULTILINE).group(1)
