@@ -22,6 +22,7 @@ PATCH_UNIT = 48.0  # the mouth is at most this wide, in pixels, in the patch tha
 PERSPECTIVE_PRIOR = 4.0  # [px^2]: weak data leave the two perspective terms at zero
 ROBUST_SCALE = 0.25  # [px]: a point that misses by more counts less
 MINIMUM_CORRELATION = 0.6  # a frame that resembles the reference less is not registered
+MOST_GAIN = 3.0  # a clip may have this much less or more contrast than the reference
 TEMPORAL_SMOOTHNESS = 0.5  # lambda of the second differences of a pose's corners
 
 
@@ -104,12 +105,29 @@ def _refine(gray: Gray, head: Head, pose: Floats, flow_of: Any) -> tuple[Floats,
     size = (head.patch.shape[1], head.patch.shape[0])
     for _ in range(3):
         seen = _carry_back(gray, pose, size)
-        step = _fit_homography(flow_of.calc(head.patch, seen, None), head.mask)
+        flow = flow_of.calc(head.patch, _like_patch(seen, head), None)
+        step = _fit_homography(flow, head.mask)
         pose = pose @ step
         pose = pose / pose[2, 2]
         if np.abs(step - np.eye(3))[:2, 2].max() < 1.0:
             break
     return pose, _correlation(head, _carry_back(gray, pose, size))
+
+
+def _like_patch(seen: Gray, head: Head) -> Gray:
+    """`seen` as bright and as rich in contrast as the patch: DIS takes brightness for constant."""
+    mean, deviation = _statistics(seen, head.mask)
+    wanted_mean, wanted_deviation = _statistics(head.patch, head.mask)
+    gain = np.clip(wanted_deviation / max(deviation, 1e-3), 1 / MOST_GAIN, MOST_GAIN)
+    levels = np.clip(np.rint(gain * (np.arange(256) - mean) + wanted_mean), 0, 255)
+    return levels.astype(np.uint8)[seen]
+
+
+def _statistics(gray: Gray, mask: NDArray[np.float32]) -> tuple[float, float]:
+    """Weighted mean and standard deviation."""
+    weight = mask / mask.sum()
+    mean = float((weight * gray).sum())
+    return mean, float(np.sqrt((weight * (gray - mean) ** 2).sum()))
 
 
 def _fit_homography(flow: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:

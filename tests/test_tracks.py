@@ -90,7 +90,7 @@ def test_exposure_and_white_balance_are_recovered(world, reference, tmp_path, ga
         crop(frame, plain.poses[i], plain, reference.region) for i, frame in enumerate(frames)
     ]
     for a, b in zip(crops(clip, track, reference.region), pictures, strict=True):
-        assert np.sqrt(np.mean((a - b) ** 2)) < 0.03
+        assert np.sqrt(np.mean((a - b) ** 2)) < 0.008
 
 
 def test_a_clip_of_another_scene_is_refused(reference, tmp_path):
