@@ -1,6 +1,7 @@
 """The command ``mmmgpu``: its subcommands are in mmmgpu.commands, one a module."""
 
 import io
+import os
 import sys
 from typing import Annotated
 
@@ -8,7 +9,7 @@ import typer
 
 from mmmgpu import __version__
 from mmmgpu.commands import align, demo, evaluate, info, reconstruct, speak, train
-from mmmgpu.commands.endings import guarded, prompt_interrupts
+from mmmgpu.commands.endings import INTERRUPTED, guarded, prompt_interrupts
 
 app = typer.Typer(
     name="mmmgpu",
@@ -60,4 +61,9 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # any file name can be shown
     prompt_interrupts()
-    app()
+    try:
+        app()
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            os._exit(INTERRUPTED)  # libraries may take a second to take themselves down
+        raise

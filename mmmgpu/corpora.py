@@ -13,6 +13,7 @@ from mmmgpu.alignments import (
     shift,
 )
 from mmmgpu.errors import InputError
+from mmmgpu.sounds import check_sync, read_sound
 from mmmgpu.videos import VideoInfo, probe
 
 
@@ -63,6 +64,8 @@ def _check_size(first: VideoInfo, other: VideoInfo) -> None:
 
 def _open_clip(path: Path, alignments: Path, sync: float) -> Clip:
     info = probe(path, minimum_frames=2)
+    if info.has_sound:
+        check_sync(info, read_sound(path))
     found = find_alignment(alignments, path)
     alignment = read_alignment(found)
     check_against(alignment, info.duration, found)

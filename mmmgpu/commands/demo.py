@@ -7,10 +7,8 @@ import typer
 
 from mmmgpu.commands.options import Backend, Json, LibraryDefault
 from mmmgpu.commands.places import require_output, write_results
-from mmmgpu.commands.summaries import flat, show_table
 
 EXAMPLE = "Example: mmmgpu demo --out demo"
-_DEMO = ("mmmgpu.demo", "make_demo")
 
 
 def demo(
@@ -18,18 +16,12 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for all that is made.")] = Path(
         "demo"
     ),
-    seconds: Annotated[
-        float,
-        typer.Option(
-            min=1,
-            help="Length of the corpus that is drawn and learnt.",
-            default_factory=LibraryDefault(*_DEMO, "seconds"),
-        ),
-    ],
     seed: Annotated[
         int,
         typer.Option(
-            min=0, help="Which performer.", default_factory=LibraryDefault(*_DEMO, "seed")
+            min=0,
+            help="Which performer.",
+            default_factory=LibraryDefault("mmmgpu.demo", "make_demo", "seed"),
         ),
     ],
     backend: Backend,
@@ -42,8 +34,8 @@ def demo(
     """
     require_output(out / "report.html")
     require_output(json)
+    from mmmgpu.backends import get_backend
     from mmmgpu.demo import make_demo
 
-    results = make_demo(out, seed=seed, seconds=seconds, backend=backend)
-    show_table(str(out), flat(results))
-    write_results(results, json)
+    get_backend(backend)
+    write_results(make_demo(out, seed=seed, backend=backend), json)
