@@ -34,9 +34,9 @@ FLOW_RIDGE = 1e-3  # r, as a share of the mean diagonal of the Gram matrix of th
 STEP_RIDGE = 3e-4  # the same for a Gauss-Newton step
 TEXTURE_RIDGE = 1e-6  # the same for beta: makes the programme strictly convex
 STEPS = 2  # Gauss-Newton steps
-OUTLIER = 0.08  # a pixel that differs by more than this counts less in a step
+OUTLIER = 0.2  # a pixel that differs by more than this counts less in a step
 WAYPOINTS = 1  # prototypes tried as waypoints of the flow to a frame
-NEAREST = (16, 32)  # prototypes that the first and the last estimate of beta may be made of
+NEAREST = 16  # prototypes that the first estimate of beta is made of
 MARGIN = 4  # [px] kept around the masks
 THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are looked for
 
@@ -118,13 +118,13 @@ def analyze(analyzer: Analyzer, image: F32, kernels: Backend) -> tuple[Floats, F
     small = thumbnail(image, analyzer.basis.w_t)
     order = np.argsort(((analyzer.thumbnails - small) ** 2).sum(axis=1))
     alpha = fit_flow(analyzer, _flow_to(analyzer, image, order))
-    used = np.sort(order[: NEAREST[0]])
+    used = np.sort(order[:NEAREST])
     for _ in range(STEPS):
         beta, made = _fit_texture(analyzer, image, alpha, used, kernels)
         alpha = _refine(analyzer, image, alpha, made)
         used = np.flatnonzero(beta > NO_TEXTURE)
-    used = np.union1d(used, order[: NEAREST[1]])
-    return alpha, _fit_texture(analyzer, image, alpha, used, kernels)[0]
+    every = np.arange(len(analyzer.thumbnails))
+    return alpha, _fit_texture(analyzer, image, alpha, every, kernels)[0]
 
 
 def _flow_to(analyzer: Analyzer, image: F32, order: NDArray[np.int64]) -> F32:

@@ -84,12 +84,12 @@ def cover_mask(region: Region) -> F32:
 
 def lip_mask(region: Region) -> F32:
     """w_f, shape (h, w): 1 on the lips, soft over the skin that they pull."""
-    return _soft(region, 0.80, 0.48, 0.80, 0.34)
+    return _soft(region, 0.65, 0.38, 0.60, 0.30)
 
 
 def mouth_mask(region: Region) -> F32:
     """w_t, shape (h, w): 1 on lips, teeth and tongue, soft over the skin around them."""
-    return _soft(region, 0.85, 0.50, 0.75, 0.30)
+    return _soft(region, 0.72, 0.42, 0.62, 0.30)
 
 
 def _soft(region: Region, across: float, above: float, below: float, feather: float) -> F32:
