@@ -1,5 +1,5 @@
 import pytest
-from worlds import make_world
+from worlds import make_postures, make_world
 
 from mmmgpu.backends import BACKENDS, get_backend
 
@@ -28,3 +28,15 @@ def backend(request):
 def world(tmp_path_factory):
     """A drawn person in a few short clips with sound and alignments; see `worlds`."""
     return make_world(tmp_path_factory.mktemp("world"))
+
+
+@pytest.fixture(scope="session")
+def face_and_basis():
+    """A performer and a small basis of mouth postures; see `worlds`."""
+    return make_postures()
+
+
+@pytest.fixture(scope="session")
+def basis(face_and_basis):
+    """A small basis of mouth postures of a performer."""
+    return face_and_basis[1]

@@ -7,7 +7,19 @@ import cv2
 import numpy as np
 
 from mmmgpu.alignments import Alignment, Segment, cover, write_textgrid
-from mmmgpu.performer import Articulation, Performer, articulate, performer, render
+from mmmgpu.basis import make_basis
+from mmmgpu.flows import matcher
+from mmmgpu.performer import (
+    ARTICULATORS,
+    Articulation,
+    Performer,
+    articulate,
+    landmarks,
+    performer,
+    render,
+)
+from mmmgpu.performer_articulation import REST
+from mmmgpu.regions import region_around
 from mmmgpu.video_writing import write_video
 
 FPS = 25
@@ -81,3 +93,41 @@ def make_world(folder, *, seed=5, size=(160, 144), sentences=SENTENCES):
         clips.append(clip)
         motions.append(motion)
     return World(face, tuple(clips), tuple(motions), folder)
+
+
+POSTURES = (
+    {},
+    {"jaw": 0.5, "press": 0.0},
+    {"jaw": 0.9, "press": 0.0, "lower_lip": 0.4, "upper_lip": 0.3},
+    {"width": 0.1, "round": 0.9, "press": 0.0, "jaw": 0.2},
+    {"width": 0.95, "press": 0.0, "lower_lip": 0.5, "upper_lip": 0.4},
+)
+
+
+def hold(*postures, pose=None):
+    """One frame a posture: articulators that differ from rest; `pose` (T, 4) of the head."""
+    rest = dict(zip(ARTICULATORS, REST, strict=True))
+    values = np.array([list((rest | posture).values()) for posture in postures])
+    n = len(values)
+    pose = np.zeros((n, 4)) if pose is None else np.asarray(pose, float)
+    return Articulation(values, pose, np.zeros(n), np.zeros((n, 2)), float(FPS))
+
+
+def mouth_pictures(face, motion, region):
+    """The region of every frame, (T, h, w, 3) float32 in [0, 1]; the head keeps still."""
+    x, y, w, h = region.box
+    frames = np.stack(list(render(face, motion)))
+    return np.ascontiguousarray(frames[:, y : y + h, x : x + w].astype(np.float32) / 255)
+
+
+def make_postures(seed=5, size=(160, 144)):
+    """A performer, the region of its mouth, and a basis of `POSTURES` (the first: reference)."""
+    face = performer(seed, size=size)
+    motion = hold(*POSTURES)
+    lips = landmarks(face, motion, 0)[:20]
+    mouth = (*lips.mean(axis=0), np.ptp(lips[:, 0]))
+    region = region_around(mouth, (size[1], size[0]))
+    images = mouth_pictures(face, motion, region)
+    match = matcher("dis")
+    flows = np.stack([match(images[0], image) for image in images])
+    return face, make_basis(images, flows, 0, region)
