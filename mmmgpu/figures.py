@@ -61,21 +61,24 @@ def jpeg_uri(image: NDArray[Any]) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
-def flow_arrows(image: NDArray[Any], flow: Floats, *, scale: int = 3, step: int = 6) -> Bytes:
-    """`image` (h, w, 3), `scale` times as large, with an arrow of `flow` every `step` pixels.
+def flow_arrows(image: NDArray[Any], flow: Floats, *, scale: int = 4, across: int = 12) -> Bytes:
+    """`image` (h, w, 3), `scale` times as large, with `across` arrows of `flow` from side to side.
 
-    Arrows shorter than half a pixel are left out.
+    Arrows shorter than a pixel are left out.
     """
     picture = np.ascontiguousarray(enlarged(image, scale))
+    step = max(1, round(flow.shape[1] / across))
     for y in range(step // 2, flow.shape[0], step):
         for x in range(step // 2, flow.shape[1], step):
-            dx, dy = (float(v) for v in flow[y, x])
-            if np.hypot(dx, dy) < 0.5:
+            moved = np.asarray(flow[y, x], float)
+            if np.hypot(*moved) < 1:
                 continue
-            start = (round((x + 0.5) * scale), round((y + 0.5) * scale))
-            end = (round((x + 0.5 + dx) * scale), round((y + 0.5 + dy) * scale))
-            for colour, thickness in (((0, 0, 0), 3), ((255, 230, 60), 1)):
-                cv2.arrowedLine(picture, start, end, colour, thickness, cv2.LINE_AA, tipLength=0.3)
+            start, end = (
+                tuple(int(v) for v in np.rint((at + 0.5) * scale))
+                for at in (np.array([x, y]), np.array([x, y]) + moved)
+            )
+            for colour, thickness in (((0, 0, 0), 4), ((255, 230, 60), 2)):
+                cv2.arrowedLine(picture, start, end, colour, thickness, cv2.LINE_AA, tipLength=0.25)
     return picture
 
 

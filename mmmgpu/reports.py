@@ -32,11 +32,14 @@ from mmmgpu.parallel import one_thread_each
 from mmmgpu.phones import SIL, VISEMES, arpabet
 from mmmgpu.report_tables import error_table, fact_table, lip_table, picture_table
 from mmmgpu.synthesis import synthesize_one
+from mmmgpu.tracks import frame_at
 from mmmgpu.trajectory_files import Trajectory
+from mmmgpu.videos import probe
 
 Floats = NDArray[np.float64]
 
 LARGEST_VIDEO = 4_000_000  # bytes of a video that is put into the report; larger ones are linked
+LARGEST_ARROWS = 360  # [px] width of a picture with arrows
 LARGEST_TILE = 150  # [px] height of a small picture
 FLOWS_SHOWN, CHANGES_SHOWN, STILLS_SHOWN = 6, 8, 12
 OUTLINES = (("w_f", (255, 210, 60)), ("w_t", (90, 200, 255)), ("cover", (255, 255, 255)))
@@ -54,7 +57,8 @@ h1 {{ font-size: 1.6rem; }} h2 {{ font-size: 1.25rem; margin-top: 2.5rem; }}
 figure {{ margin: 1rem 0; }} figcaption {{ font-size: .85rem; opacity: .85; }}
 img, video {{ max-width: 100%; height: auto; border-radius: 4px; display: block; }}
 .tiles {{ display: grid; gap: .6rem; grid-template-columns: repeat(auto-fill, minmax(92px, 1fr)); }}
-.tiles.wide {{ grid-template-columns: repeat(auto-fill, minmax(200px, 1fr)); }}
+.tiles.wide {{ grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); }}
+.tiles.middle {{ grid-template-columns: repeat(auto-fit, minmax(110px, 14rem)); }}
 .tiles figure {{ margin: 0; }} .tiles img {{ width: 100%; }}
 .tiles figcaption {{ text-align: center; font-size: .75rem; }}
 .pair {{ display: flex; gap: 2px; }} .pair img {{ width: 50%; }}
@@ -161,7 +165,12 @@ def _video(caption: str, path: Path, page: Path) -> str:
     if len(data) > LARGEST_VIDEO or path.suffix.lower() != ".mp4":
         return f"<figure>{text}</figure>"
     address = "data:video/mp4;base64," + base64.b64encode(data).decode()
-    player = f'<video controls playsinline src="{address}" aria-label="{escape(caption)}"></video>'
+    poster = jpeg_uri(frame_at(path, probe(path).frames // 2))
+    label = escape(caption)
+    player = (
+        f'<video controls playsinline poster="{poster}" src="{address}" aria-label="{label}">'
+        "</video>"
+    )
     return f"<figure>{player}{text}</figure>"
 
 
@@ -181,10 +190,10 @@ def _reference(model: Model) -> str:
     return (
         "<h2>The reference</h2><p>One calm frame is the reference "
         f"(frame {t} of {escape(name)}): every other mouth is described as this one moved. "
-        "The masks, found from picture and sound alone, say where.</p>"
+        "The masks say where.</p>"
         + _figure(picture, "The reference with the half-way lines of the lip mask w_f (yellow), "
                   "the mouth mask w_t (blue) and the cover (white).")
-        + f'<div class="tiles wide">{"".join(parts)}</div>'
+        + f'<div class="tiles middle">{"".join(parts)}</div>'
     )  # fmt: skip
 
 
@@ -208,21 +217,16 @@ def _prototypes(model: Model) -> str:
 def _flows(model: Model) -> str:
     basis = model.basis
     moved = np.sqrt((basis.flows**2).sum(axis=-1) * basis.w_f).mean(axis=(1, 2))
-    height = basis.region.shape[0]
-    scale = max(1, round(320 / height))
+    origin = basis.images[basis.reference]
+    scale = max(1, round(LARGEST_ARROWS / origin.shape[1]))
     tiles = "".join(
-        f'<figure><div class="pair">{_img(drawn, f"arrows of flow {i}")}'
-        f"{_img(enlarged(basis.images[i], scale), f'prototype {i}')}</div>"
-        f"<figcaption>to prototype {i}</figcaption></figure>"
+        _pair(
+            flow_arrows(origin, basis.flows[i], scale=scale),
+            enlarged(basis.images[i], scale),
+            (f"arrows of flow {i} on the reference", f"prototype {i}"),
+            f"to prototype {i}",
+        )
         for i in np.argsort(-moved)[:FLOWS_SHOWN]
-        for drawn in [
-            flow_arrows(
-                basis.images[basis.reference],
-                basis.flows[i],
-                scale=scale,
-                step=max(5, height // 18),
-            )
-        ]
     )
     return (
         "<h2>Flows</h2><p>A flow says where each point of the reference has gone in a prototype: "
@@ -276,12 +280,13 @@ def _training(model: Model, backend: str) -> str:
     change = np.linalg.norm(alpha.trained.mean - alpha.pooled.mean, axis=1)
     labels = [alpha.trained.labels[i] for i in np.argsort(-change)[:CHANGES_SHOWN]]
     pairs = "".join(
-        f'<figure><div class="pair">{_img(_tile_sized(before), f"{label} before training")}'
-        f"{_img(_tile_sized(after), f'{label} after training')}</div>"
-        f"<figcaption>{escape(label)}: before, after</figcaption></figure>"
+        _pair(
+            _tile_sized(_mean_picture(model, label, backend, trained=False)),
+            _tile_sized(_mean_picture(model, label, backend, trained=True)),
+            (f"{label} before training", f"{label} after training"),
+            f"{label}: before, after",
+        )
         for label in labels
-        for before in [_mean_picture(model, label, backend, trained=False)]
-        for after in [_mean_picture(model, label, backend, trained=True)]
     )
     errors = {
         f"{name} (clips learned from)": stream.history.training.sum(axis=1)
@@ -397,6 +402,13 @@ def _tile(image: NDArray[Any], caption: str, *, alt: str = "", marked: bool = Fa
     kind = ' class="chosen"' if marked else ""
     shown = _img(_tile_sized(image), alt or caption)
     return f"<figure{kind}>{shown}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _pair(left: NDArray[Any], right: NDArray[Any], alts: tuple[str, str], caption: str) -> str:
+    """Two pictures beside each other with one caption."""
+    shown = _img(left, alts[0]) + _img(right, alts[1])
+    text = f"<figcaption>{escape(caption)}</figcaption>"
+    return f'<figure><div class="pair">{shown}</div>{text}</figure>'
 
 
 def _figure(image: NDArray[Any], caption: str) -> str:
