@@ -1,13 +1,15 @@
 """Models on disk: one safetensors file, checked before it is used. No pickle anywhere.
 
-Tensors are flat and named after the fields of `Model`; what is no array lies as JSON in the header
-beside ``format`` and ``version``.
+Tensors are flat and named after the fields of `Model`; what is no array lies, with ``format`` and
+``version``, as JSON in the header's one entry ``mmmgpu`` (several would come in random order, and
+the same model would not be the same bytes).
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from mmmgpu.trajectory_training import Constants, History, TrainedStream
 
 Tensors = dict[str, NDArray[Any]]
 
+HEADER = "mmmgpu"
 FORMAT = "mmmgpu-model"
 VERSION = 1
 
@@ -35,11 +38,8 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write `model` to `path`, whole or not at all."""
     from safetensors.numpy import save
 
-    header = {
-        "format": FORMAT,
-        "version": str(VERSION),
-        "model": json.dumps(_facts(model), ensure_ascii=False, allow_nan=False),
-    }
+    facts = {"format": FORMAT, "version": VERSION, **_facts(model)}
+    header = {HEADER: json.dumps(facts, ensure_ascii=False, allow_nan=False)}
     tensors = {name: np.ascontiguousarray(value) for name, value in _tensors(model).items()}
     write_bytes(path, save(tensors, metadata=header))  # its save_file hides why it fails
 
@@ -58,30 +58,51 @@ def load(path: str | os.PathLike[str]) -> Model:
         raise InputError(f"{path}: no such model file; train one with: mmmgpu train")
     try:
         with safe_open(str(path), framework="numpy") as file:
-            header = file.metadata() or {}
-            _check_header(path, header)
+            facts = _read_header(path, (file.metadata() or {}).get(HEADER, "null"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as e:
-        if isinstance(e, InputError):
-            raise
-        raise InputError(f"{path}: truncated, damaged or not a model ({e}); train it again") from e
-    try:
-        facts = json.loads(header["model"])
+        _check_facts(path, facts)
         _check_tensors(path, tensors, facts)
         return _assemble(tensors, facts)
-    except (KeyError, TypeError, IndexError, json.JSONDecodeError) as e:
+    except InputError:
+        raise
+    except (SafetensorError, OSError) as e:
+        raise InputError(f"{path}: truncated, damaged or not a model ({e}); train it again") from e
+    except (LookupError, TypeError, ValueError, AttributeError) as e:  # of a header like no other
         raise InputError(f"{path}: the model lacks or misstates {e}; train it again") from e
 
 
-def _check_header(path: Path, header: dict[str, str]) -> None:
-    if header.get("format") != FORMAT:
+def _read_header(path: Path, text: str) -> dict[str, Any]:
+    try:
+        facts = json.loads(text)
+    except json.JSONDecodeError:
+        facts = None
+    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         raise InputError(f"{path}: not a mmmgpu model; give a file that mmmgpu train has written")
-    version = header.get("version", "")
-    if not version.isdecimal() or int(version) > VERSION:
+    version = facts.get("version")
+    if type(version) is not int or not 1 <= version <= VERSION:
         raise InputError(
-            f"{path}: has format version {version!r}, this mmmgpu reads up to {VERSION}; "
+            f"{path}: has format version {version}, this mmmgpu reads up to {VERSION}; "
             "update mmmgpu"
         )
+    return facts
+
+
+def _check_facts(path: Path, facts: dict[str, Any]) -> None:
+    """What is no array is of the right kind and in its range."""
+    m, region, fps = len(facts["sources"]), facts["region"], facts["fps"]
+    good = {
+        "reference": type(facts["reference"]) is int and 0 <= facts["reference"] < m and m >= 2,
+        "region": [type(v) for v in region["box"]] == [int] * 4
+        and min(region["box"][2:]) > 0
+        and np.isfinite(region["mouth"]).tolist() == [True] * 3
+        and region["mouth"][2] > 0,
+        "fps": [type(v) for v in fps] == [int] * 2 and min(fps) > 0,
+        "calm.suffix": re.fullmatch(r"(\.[^./\\\0]+)?", facts["calm"]["suffix"]) is not None,
+        "calm.residual": bool(np.isfinite(facts["calm"]["residual"])),
+    }
+    for name, is_good in good.items():
+        if not is_good:
+            raise InputError(f"{path}: the model misstates {name}; train it again")
 
 
 def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
@@ -127,8 +148,12 @@ def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
             )
         if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
             raise InputError(f"{path}: tensor {name} holds NaN or infinity; train the model again")
-    if not 0 <= facts["reference"] < m or m < 2 or frames < 1:
-        raise InputError(f"{path}: the model has no valid reference or background; train it again")
+        if name.endswith(".variance") and not (tensor > 0).all():
+            raise InputError(f"{path}: tensor {name} must be above zero; train the model again")
+        if name in ("calm.poses", "head.to_frame") and not np.linalg.det(tensor).all():
+            raise InputError(f"{path}: tensor {name} cannot be inverted; train the model again")
+    if frames < 1:
+        raise InputError(f"{path}: the model has no background; train it again")
 
 
 def _facts(model: Model) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Small worlds for tests: a drawn person who says a few phones, in clips with sound."""
 
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 from mmmgpu.alignments import Alignment, Segment, cover, write_textgrid
 from mmmgpu.basis import make_basis
 from mmmgpu.flows import matcher
+from mmmgpu.models import Calm, Model
 from mmmgpu.performer import (
     ARTICULATORS,
     Articulation,
@@ -19,7 +21,11 @@ from mmmgpu.performer import (
     render,
 )
 from mmmgpu.performer_articulation import REST
+from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.regions import region_around
+from mmmgpu.registration import Head
+from mmmgpu.tracks import Reference, Track
+from mmmgpu.trajectory_training import Constants, History, TrainedStream
 from mmmgpu.video_writing import write_video
 
 FPS = 25
@@ -131,3 +137,41 @@ def make_postures(seed=5, size=(160, 144)):
     match = matcher("dis")
     flows = np.stack([match(images[0], image) for image in images])
     return face, make_basis(images, flows, 0, region)
+
+
+def make_stream(rng, dims, labels=("AA", "M", "SIL")):
+    """Phoneme models of one stream that nobody has trained."""
+    shape = (len(labels), dims)
+    count = np.arange(5, 5 + len(labels))
+    pooled, trained = (
+        PhonemeModels(tuple(labels), rng.normal(size=shape), rng.uniform(0.5, 2, shape), count)
+        for _ in range(2)
+    )
+    history = History(rng.random((4, dims)))
+    constants = Constants(smoothness=2.0, order=3, ridge=4.0, iterations=3)
+    return TrainedStream(pooled, trained, rng.random(dims), constants, history, rng.random(6))
+
+
+def make_model(basis, *, seed=0):
+    """A whole model about `basis` of which every number is another, for files and readers."""
+    rng = np.random.default_rng(seed)
+    count = len(basis.images)
+    poses = np.eye(3) + 0.01 * rng.normal(size=(7, 3, 3))
+    registered = rng.random(7) > 0.3
+    track = Track(poses, registered, rng.random(7), rng.random(3), rng.random(3), 0.125)
+    head = Head(
+        rng.integers(0, 256, (9, 11), np.uint8), rng.random((9, 11), np.float32), poses[0] * 2
+    )
+    points = rng.random((13, 2))
+    reference = Reference(head, rng.random((13, 3), np.float32), points, basis.region)
+    return Model(
+        basis=basis,
+        reference=reference,
+        alpha=make_stream(rng, count - 1),
+        beta=make_stream(rng, count),
+        fps=Fraction(30000, 1001),
+        prototype_frames=rng.integers(0, 256, (count, 50, 60, 3), np.uint8),
+        sources=tuple((f"clip ü {i}.mkv", 10 * i) for i in range(count)),
+        calm=Calm(rng.integers(0, 256, 100, np.uint8), ".mkv", track),
+        notes={"skipped": {"a.mkv": "why"}, "seed": 3, "residual": 0.1},
+    )

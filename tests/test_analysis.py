@@ -1,0 +1,237 @@
+from dataclasses import replace
+
+import numpy as np
+import oracles_model as oracles
+import pytest
+from scipy.optimize import minimize
+from worlds import POSTURES, hold, mouth_pictures
+
+from mmmgpu.analysis import (
+    FLOW_RIDGE,
+    TEXTURE_RIDGE,
+    analyze,
+    fit_flow,
+    prepare_analysis,
+    solve_simplex,
+    thumbnail,
+)
+from mmmgpu.analysis import _fit_texture as fit_texture
+from mmmgpu.analysis import _refine as refine
+from mmmgpu.backends import get_backend
+from mmmgpu.synthesis import synthesize_one
+
+
+@pytest.fixture(scope="module")
+def analyzer(basis):
+    return prepare_analysis(basis)
+
+
+@pytest.fixture(scope="module")
+def kernels():
+    return get_backend("numpy")
+
+
+def psnr(image, wanted, mask):
+    miss = (mask[..., None] * (image.astype(float) - wanted) ** 2).sum() / (3 * mask.sum())
+    return -10 * np.log10(max(miss, 1e-12))
+
+
+def regular(gram):
+    return gram + TEXTURE_RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+
+
+def problem(n, rank, seed):
+    """A random Gram matrix (n, n) of `rank` and a right-hand side within its range."""
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(n, rank))
+    return a @ a.T, a @ rng.normal(size=rank)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("n", "rank"), [(1, 1), (2, 2), (7, 7), (7, 3), (6, 1)])
+def test_beta_is_the_best_of_all_supports(n, rank, seed):
+    gram, right = problem(n, rank, seed)
+    before = gram.copy(), right.copy()
+    got = solve_simplex(gram, right)
+    assert got.min() >= 0
+    assert got.sum() == pytest.approx(1, abs=1e-12)
+    g = regular(gram)
+    wanted = oracles.solve_simplex(g, right)
+
+    def cost(b):
+        return b @ g @ b / 2 - right @ b
+
+    np.testing.assert_allclose(cost(got), cost(wanted), rtol=1e-7, atol=1e-9)
+    if rank == n:
+        np.testing.assert_allclose(got, wanted, atol=1e-6)
+    np.testing.assert_array_equal(gram, before[0])
+    np.testing.assert_array_equal(right, before[1])
+
+
+@pytest.mark.parametrize(("n", "rank"), [(46, 46), (46, 20), (50, 8)])
+def test_beta_of_many_prototypes_meets_the_optimality_conditions(n, rank):
+    gram, right = problem(n, rank, 1)
+    got = solve_simplex(gram, right)
+    slope = regular(gram) @ got - right
+    multiplier = slope[got > 1e-9].mean()
+    scale = np.abs(slope).max()
+    np.testing.assert_allclose(slope[got > 1e-9], multiplier, atol=1e-6 * scale)
+    assert (slope[got <= 1e-9] >= multiplier - 1e-6 * scale).all()
+
+
+def test_beta_agrees_with_slsqp():
+    gram, right = problem(12, 12, 3)
+    g = regular(gram)
+    found = minimize(
+        lambda b: b @ g @ b / 2 - right @ b,
+        np.full(12, 1 / 12),
+        jac=lambda b: g @ b - right,
+        bounds=[(0, None)] * 12,
+        constraints={"type": "eq", "fun": lambda b: b.sum() - 1, "jac": lambda b: np.ones(12)},
+        method="SLSQP",
+        options={"ftol": 1e-15, "maxiter": 500},
+    )
+    np.testing.assert_allclose(solve_simplex(gram, right), found.x, atol=1e-6)
+
+
+def test_equal_prototypes_share_their_beta():
+    gram, _ = problem(3, 3, 0)
+    twice = [0, 1, 2, 2]
+    alone = solve_simplex(gram, gram[2])
+    both = solve_simplex(gram[np.ix_(twice, twice)], gram[2][twice])
+    assert alone[2] > 0.9
+    np.testing.assert_allclose(both[2:].sum(), alone[2], atol=1e-3)
+    assert both[2] == pytest.approx(both[3], abs=1e-3)
+
+
+def test_float32_sums_are_good_enough():
+    gram, right = problem(46, 30, 5)
+    single = solve_simplex(gram.astype(np.float32), right.astype(np.float32))
+    double = solve_simplex(gram, right)
+    g = regular(gram)
+    cost = [b @ g @ b / 2 - right @ b for b in (single, double)]
+    assert cost[0] - cost[1] < 1e-4 * abs(cost[1])
+
+
+def test_alpha_is_the_ridge_regression_of_the_flow(basis, analyzer):
+    rng = np.random.default_rng(0)
+    flow = rng.normal(size=analyzer.basis.flows.shape[1:]).astype(np.float32)
+    rows, wanted = [], []
+    h, w = analyzer.basis.w_f.shape
+    for y in range(h):
+        for x in range(w):
+            weight = analyzer.basis.w_f[y, x]
+            if weight > 0.02:
+                for c in range(2):
+                    own = analyzer.basis.flows[analyzer.basis.moving, y, x, c]
+                    rows.append(np.sqrt(weight) * own.astype(float))
+                    wanted.append(np.sqrt(weight) * float(flow[y, x, c]))
+    rows = np.array(rows)
+    ridge = np.sqrt(FLOW_RIDGE * (rows**2).sum() / rows.shape[1]) * np.eye(rows.shape[1])
+    system = np.concatenate([rows, ridge])
+    right = np.append(wanted, np.zeros(len(ridge)))
+    solution = np.linalg.lstsq(system, right, rcond=None)[0]
+    np.testing.assert_allclose(fit_flow(analyzer, flow), solution, rtol=1e-3, atol=1e-4)
+
+
+def test_a_flow_of_the_model_gives_its_alpha(analyzer):
+    alpha = np.array([0.3, -0.2, 0.5, 0.1])
+    got = fit_flow(analyzer, analyzer.basis.flow(alpha))
+    np.testing.assert_allclose(got, alpha, atol=0.03)  # the ridge pulls a little
+
+
+def test_the_region_is_cut_to_its_masks(basis, analyzer):
+    assert analyzer.basis.w_t.size < basis.w_t.size
+    for name in ("w_f", "w_t"):
+        assert getattr(analyzer.basis, name).sum() == pytest.approx(
+            getattr(basis, name).sum(), rel=0.01
+        )
+        cut = getattr(basis, name)[analyzer.inside]
+        np.testing.assert_array_equal(getattr(analyzer.basis, name), cut)
+
+
+def test_thumbnails_see_only_what_the_mask_shows(basis):
+    image = basis.images[1].copy()
+    small = thumbnail(image, basis.w_t)
+    image[basis.w_t == 0] = 1.0
+    np.testing.assert_array_equal(thumbnail(image, basis.w_t), small)
+    image[basis.w_t > 0.9] = 1.0
+    assert np.abs(thumbnail(image, basis.w_t) - small).max() > 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_picture_of_the_model_is_made_again(basis, analyzer, kernels, seed):
+    rng = np.random.default_rng(seed)
+    alpha = rng.dirichlet(np.ones(5))[1:]
+    beta = rng.dirichlet(np.full(5, 0.7))
+    image = synthesize_one(basis, alpha, beta, kernels)
+    a, b = analyze(analyzer, image, kernels)
+    assert a.shape == (4,)
+    assert b.shape == (5,)
+    assert b.min() >= 0
+    assert b.sum() == pytest.approx(1)
+    again = synthesize_one(basis, a, b, kernels)
+    assert psnr(again, image, basis.w_t) > 38
+    neutral = basis.images[basis.reference]
+    assert psnr(again, image, basis.w_t) > psnr(neutral, image, basis.w_t) + 6
+
+
+def test_prototypes_are_made_again(basis, analyzer, kernels):
+    for image in basis.images:
+        a, b = analyze(analyzer, image, kernels)
+        assert psnr(synthesize_one(basis, a, b, kernels), image, basis.w_t) > 36
+
+
+def test_postures_between_the_prototypes_are_made(face_and_basis, analyzer, kernels):
+    face, basis = face_and_basis
+    new = hold(
+        POSTURES[0], {"jaw": 0.7, "press": 0.0, "lower_lip": 0.2}, {"jaw": 0.3, "press": 0.0}
+    )
+    for image in mouth_pictures(face, new, basis.region)[1:]:
+        a, b = analyze(analyzer, image, kernels)
+        made = psnr(synthesize_one(basis, a, b, kernels), image, basis.w_t)
+        nearest = max(psnr(p, image, basis.w_t) for p in basis.images)
+        assert made > 28
+        assert made > nearest + 2
+
+
+def test_both_backends_find_the_same(basis, analyzer, kernels, backend):
+    image = (0.5 * basis.images[1] + 0.5 * basis.images[2]).astype(np.float32)
+    wanted = analyze(analyzer, image, kernels)
+    got = analyze(analyzer, image, get_backend(backend))
+    for a, b in zip(got, wanted, strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_lowers_the_difference_of_the_pictures(basis, analyzer, kernels, seed):
+    rng = np.random.default_rng(seed)
+    beta = rng.dirichlet(np.ones(5))
+    alpha = rng.dirichlet(np.ones(5))[1:]
+    image = synthesize_one(basis, alpha, beta, kernels)[analyzer.inside]
+    start = alpha + 0.12 * rng.normal(size=4)
+    everything = np.arange(5)
+
+    def error(a):
+        _, made = fit_texture(analyzer, image, a, everything, kernels)
+        return -psnr(made, image, analyzer.basis.w_f), made
+
+    before, made = error(start)
+    stepped = refine(analyzer, image, start, made)
+    assert error(stepped)[0] < before - 1
+
+
+def test_a_step_from_the_truth_stays(basis, analyzer, kernels):
+    alpha = np.array([0.2, 0.3, 0.1, 0.1])
+    beta = np.array([0.2, 0.3, 0.2, 0.2, 0.1])
+    image = synthesize_one(basis, alpha, beta, kernels)[analyzer.inside]
+    stepped = refine(analyzer, image, alpha, image)
+    np.testing.assert_allclose(stepped, alpha, atol=0.02)
+
+
+def test_inputs_are_not_changed(basis, analyzer, kernels):
+    image = basis.images[3].copy()
+    analyze(analyzer, image, kernels)
+    np.testing.assert_array_equal(image, basis.images[3])
+    again = prepare_analysis(replace(basis))
+    np.testing.assert_array_equal(again.thumbnails, analyzer.thumbnails)

@@ -1,0 +1,219 @@
+import json
+import pickle
+import struct
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+from worlds import make_model
+
+from mmmgpu.errors import InputError
+from mmmgpu.model_files import FORMAT, VERSION, load, save_model
+
+
+@pytest.fixture(scope="module")
+def model(basis):
+    return make_model(basis)
+
+
+@pytest.fixture(scope="module")
+def data(model, tmp_path_factory):
+    """The bytes of a good file."""
+    path = tmp_path_factory.mktemp("model") / "good.mmm"
+    save_model(model, path)
+    return path.read_bytes()
+
+
+def assert_same(a, b, where=""):
+    """Equal in every field, arrays bit for bit and of one type."""
+    if is_dataclass(a):
+        assert type(a) is type(b)
+        for field in fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, np.ndarray):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype), where
+        np.testing.assert_array_equal(a, b, err_msg=where)
+    else:
+        assert a == b, where
+        assert type(a) is type(b), where
+
+
+def test_a_model_comes_back_bit_for_bit(model, tmp_path):
+    path = tmp_path / "a model ü.mmm"
+    save_model(model, path)
+    assert_same(load(path), model)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_the_same_model_is_the_same_file(model, data, tmp_path):
+    for i in range(8):
+        save_model(model, tmp_path / f"{i}.mmm")
+        assert (tmp_path / f"{i}.mmm").read_bytes() == data
+
+
+def test_the_header_is_json_that_names_format_and_version(data):
+    (length,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + length])
+    assert json.loads(header["__metadata__"]["mmmgpu"])["format"] == FORMAT
+    assert json.loads(header["__metadata__"]["mmmgpu"])["version"] == VERSION
+
+
+def test_tensors_need_not_lie_in_one_piece(model, tmp_path):
+    from dataclasses import replace
+
+    frames = np.asfortranarray(model.prototype_frames)
+    save_model(replace(model, prototype_frames=frames), tmp_path / "a.mmm")
+    assert_same(load(tmp_path / "a.mmm"), model)
+
+
+def rewritten(path, data, *, tensors=None, facts=None, metadata=None):
+    """The good file with some tensors or header entries changed."""
+    path.write_bytes(data)
+    known = load_file(str(path))
+    (length,) = struct.unpack("<Q", data[:8])
+    said = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["mmmgpu"])
+    known.update(tensors(known) if tensors else {})
+    known = {name: np.ascontiguousarray(t) for name, t in known.items() if t is not None}
+    said.update(facts(said) if facts else {})
+    said = {name: value for name, value in said.items() if value is not None}
+    save_file(known, str(path), metadata=metadata or {"mmmgpu": json.dumps(said)})
+
+
+NOTHING = {
+    "empty": lambda data: b"",
+    "three bytes": lambda data: data[:3],
+    "half a header": lambda data: data[:700],
+    "header only": lambda data: data[: 8 + struct.unpack("<Q", data[:8])[0]],
+    "half": lambda data: data[: len(data) // 2],
+    "one byte short": lambda data: data[:-1],
+    "one byte more": lambda data: data + b"\0",
+    "text": lambda data: b"I am a model, believe me.\n" * 50,
+    "pickle": lambda data: pickle.dumps({"images": [1, 2, 3]}),
+    "zip": lambda data: b"PK\x03\x04" + bytes(500),
+    "huge header": lambda data: struct.pack("<Q", 2**62) + data[8:],
+    "header no json": lambda data: data[:8] + b"x" * 300 + data[308:],
+}
+
+
+@pytest.mark.parametrize("fault", NOTHING)
+def test_what_is_no_whole_model_file_is_said_on_one_line(data, tmp_path, fault):
+    path = tmp_path / "bad ü.mmm"
+    path.write_bytes(NOTHING[fault](data))
+    with pytest.raises(InputError, match=r"bad ü\.mmm: ") as error:
+        load(path)
+    assert "\n" not in str(error.value)
+
+
+class Bomb:
+    def __reduce__(self):
+        return (pytest.fail, ("the pickle was opened",))
+
+
+def test_a_pickle_in_disguise_is_never_opened(tmp_path):
+    path = tmp_path / "bomb.mmm"
+    path.write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(InputError, match=r"bomb\.mmm: "):
+        load(path)
+
+
+TENSORS = {
+    "missing": (lambda t: {"flows": None}, "flows"),
+    "wrong shape": (lambda t: {"flows": t["flows"][:, :-1]}, "flows must be"),
+    "one prototype less": (lambda t: {"images": t["images"][1:]}, "images must be"),
+    "wrong type": (lambda t: {"images": t["images"].astype(np.float16)}, "images must be"),
+    "NaN": (lambda t: {"w_t": np.full_like(t["w_t"], np.nan)}, "w_t holds NaN"),
+    "infinite": (lambda t: {"alpha.trained.mean": t["alpha.trained.mean"] * np.inf}, "mean holds"),
+    "a variance of zero": (
+        lambda t: {"beta.trained.variance": t["beta.trained.variance"] * 0},
+        "trained.variance must be above",
+    ),
+    "singular pose": (lambda t: {"calm.poses": t["calm.poses"] * 0}, "calm.poses"),
+    "no background": (
+        lambda t: {n: t[n][:0] for n in ("calm.poses", "calm.registered", "calm.correlation")},
+        "background",
+    ),
+    "history of another size": (lambda t: {"beta.training": t["beta.training"][:, 1:]}, "training"),
+    "scalar": (lambda t: {"calm.poses": np.float64(3.0)}, ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", TENSORS)
+def test_a_bad_tensor_is_named(data, tmp_path, fault):
+    change, message = TENSORS[fault]
+    path = tmp_path / "bad.mmm"
+    rewritten(path, data, tensors=change)
+    with pytest.raises(InputError, match=rf"bad\.mmm: .*{message}") as error:
+        load(path)
+    assert "\n" not in str(error.value)
+
+
+def region(box, mouth=(50.0, 60.0, 20.0)):
+    return lambda facts: {"region": {"box": box, "mouth": mouth}}
+
+
+FACTS = {
+    "newer": (lambda f: {"version": VERSION + 1}, f"format version {VERSION + 1}.*update"),
+    "no version": (lambda f: {"version": None}, "version"),
+    "version no number": (lambda f: {"version": "one"}, "version"),
+    "another format": (lambda f: {"format": "other"}, "not a mmmgpu model"),
+    "reference beyond": (lambda f: {"reference": 5}, "reference"),
+    "reference negative": (lambda f: {"reference": -1}, "reference"),
+    "reference no number": (lambda f: {"reference": "first"}, ""),
+    "box of three": (region([1, 2, 3]), ""),
+    "box of text": (region(["a", "b", "c", "d"]), ""),
+    "box of null": (region([None] * 4), ""),
+    "no region": (lambda f: {"region": None}, "region"),
+    "region a list": (lambda f: {"region": [1, 2]}, ""),
+    "rate of zero": (lambda f: {"fps": [25, 0]}, ""),
+    "rate below zero": (lambda f: {"fps": [-25, 1]}, ""),
+    "rate no list": (lambda f: {"fps": "fast"}, ""),
+    "sources of one": (lambda f: {"sources": [["a"]] * 5}, ""),
+    "sources a number": (lambda f: {"sources": 3}, ""),
+    "labels missing": (lambda f: {"alpha": {"constants": f["alpha"]["constants"]}}, "labels"),
+    "labels less": (lambda f: {"alpha": f["alpha"] | {"labels": ["AA"]}}, "alpha"),
+    "constants unknown": (lambda f: {"beta": f["beta"] | {"constants": {"x": 1}}}, ""),
+    "calm a number": (lambda f: {"calm": 3}, ""),
+    "suffix a path": (lambda f: {"calm": f["calm"] | {"suffix": "/../../x.mkv"}}, "suffix"),
+}
+
+
+@pytest.mark.parametrize("fault", FACTS)
+def test_a_bad_header_is_said_on_one_line(data, tmp_path, fault):
+    change, message = FACTS[fault]
+    path = tmp_path / "bad.mmm"
+    rewritten(path, data, facts=change)
+    with pytest.raises(InputError, match=rf"bad\.mmm: .*{message}") as error:
+        load(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("said", ["", "[]", "3", "null", "{}", '{"format"'])
+def test_another_safetensors_file_is_no_model(data, tmp_path, said):
+    path = tmp_path / "other.safetensors"
+    rewritten(path, data, metadata={"mmmgpu": said})
+    with pytest.raises(InputError, match=r"other\.safetensors: not a mmmgpu model"):
+        load(path)
+    save_file({"weights": np.zeros(3)}, str(path))
+    with pytest.raises(InputError, match=r"other\.safetensors: not a mmmgpu model"):
+        load(path)
+
+
+def test_missing_files_and_folders_are_said(tmp_path):
+    for name in ("nothing.mmm", ""):
+        with pytest.raises(InputError, match=r"no such model file; .*mmmgpu train"):
+            load(tmp_path / name)
+
+
+def test_a_failed_write_leaves_the_old_model(model, data, tmp_path, monkeypatch):
+    path = tmp_path / "a.mmm"
+    path.write_bytes(data)
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(InputError, match=r"a\.mmm: the disk is full"):
+        save_model(model, path)
+    assert path.read_bytes() == data
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mmm"]
