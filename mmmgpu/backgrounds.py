@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mmmgpu.files import write_bytes
 from mmmgpu.models import Model
 from mmmgpu.tracks import Track, track_clip
 from mmmgpu.videos import probe, read_frames
@@ -39,7 +40,7 @@ def open_background(model: Model, path: Path | None) -> Iterator[Background]:
         return
     with tempfile.TemporaryDirectory(prefix="mmmgpu-") as folder:
         own = Path(folder) / f"calm{model.calm.suffix}"
-        own.write_bytes(model.calm.data.tobytes())
+        write_bytes(own, model.calm.data.tobytes())
         yield Background(own, probe(own).fps, model.calm.track)
 
 
