@@ -28,7 +28,7 @@ from mmmgpu.voices import Speech
 Floats = NDArray[np.float64]
 
 ARTICULATION = (0.5, 1.5)  # least and most
-FAINT = 0.005  # taken off every beta: prototypes that cannot be seen need not be warped
+FAINT = 0.02  # taken off every beta: faint textures blur the teeth and cost time
 
 
 def speak(
