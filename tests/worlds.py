@@ -43,13 +43,14 @@ class World:
     """Clips of one performer with their truth.
 
     face: who speaks. clips: video files. motions: what each clip shows.
-    alignments: the folder of their TextGrids.
+    alignments: the folder of their TextGrids. sentences: the phones of each clip.
     """
 
     face: Performer
     clips: tuple[Path, ...]
     motions: tuple[Articulation, ...]
     alignments: Path
+    sentences: tuple[str, ...]
 
 
 def texture(height, width, *, grain=2.0, seed=0):
@@ -98,7 +99,7 @@ def make_world(folder, *, seed=5, size=(160, 144), sentences=SENTENCES):
         write_textgrid(alignment, clip.with_suffix(".TextGrid"))
         clips.append(clip)
         motions.append(motion)
-    return World(face, tuple(clips), tuple(motions), folder)
+    return World(face, tuple(clips), tuple(motions), folder, tuple(sentences))
 
 
 POSTURES = (
