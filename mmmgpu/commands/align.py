@@ -57,7 +57,8 @@ def align(
             result = {"status": "failed", "reason": reason}
         results.append({"clip": str(clip), "textgrid": str(textgrid), **result})
     counts = {s: sum(r["status"] == s for r in results) for s in ("aligned", "kept", "failed")}
-    show_table(str(out), counts.items())
+    if counts["failed"] < len(results):
+        show_table(str(out), counts.items())
     write_results({"folder": str(out), **counts, "clips": results}, json)
     if counts["failed"]:
         raise typer.Exit(1)
