@@ -28,7 +28,7 @@ ELSEWHERE = re.compile(  # a folder of one machine, an address, a name in a priv
 )
 
 # Tests that mirror no module: they hold for several, or for all.
-TOPICS = {"api", "house", "kernel_twins", "no_vacuous_tests", "packaging", "real"}
+TOPICS = {"api", "bad_input", "house", "kernel_twins", "no_vacuous_tests", "packaging", "real"}
 
 # cli -> domain -> arrays, backends -> kernels: a module may import its own layer and those below.
 LAYERS = {
