@@ -67,16 +67,19 @@ def until_cancelled(ended):
 
 
 def test_a_failure_reaches_the_caller_and_stops_the_others():
-    ended = []
+    ended, second_began = [], threading.Event()
     endless = until_cancelled(ended)
 
     def work(item, cancelled):
         if item == 0:
+            assert second_began.wait(10)
             raise ZeroDivisionError("item 0")
+        second_began.set()
         return endless(item, cancelled)
 
     with pytest.raises(ZeroDivisionError, match="item 0"):
         list(map_ordered(work, range(50), threads=3))
+    assert ended
     assert set(ended) <= {1, 2, 3}  # the others never began
 
 

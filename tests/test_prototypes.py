@@ -117,8 +117,9 @@ def test_too_few_frames_are_an_error():
 
 
 def test_the_reference_is_like_silence():
-    points = np.array([[0, 0], [1, 0], [5, 5], [9, 9], [5.2, 5.1], [4.9, 5.3]], np.float32)
-    silent = np.array([0, 0, 1, 0, 1, 1], bool)
-    chosen = np.array([0, 1, 3, 4])
-    assert most_neutral(points, chosen, silent) == 3
-    assert most_neutral(points[:4], np.array([0, 1, 3]), np.zeros(4, bool)) == 1  # median (3, 2.5)
+    points = np.array([[0], [1], [2], [3], [20], [21], [90]], np.float32)
+    silent = np.array([0, 0, 0, 0, 1, 1, 1], bool)
+    chosen = np.array([0, 2, 5, 6])
+    assert most_neutral(points, chosen, silent) == 2  # the median of silence; its mean is 43.7
+    assert most_neutral(points, chosen, ~silent) == 1
+    assert most_neutral(points, chosen, np.zeros(7, bool)) == 1  # the median of all is 3
