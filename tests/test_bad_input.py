@@ -4,6 +4,7 @@ And the odd input that is no bad one: turned, variable, grey and quiet video, st
 """
 
 import errno
+import functools
 import json
 import os
 import pickle
@@ -20,6 +21,7 @@ from media import cut, encode, encode_sound, set_display_matrix, tone
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from mmmgpu import aligner, reconstruction, training
 from mmmgpu.model_files import HEADER, VERSION, load
 from mmmgpu.sounds import write_wav
 from mmmgpu.videos import probe, read_frames
@@ -308,8 +310,21 @@ def test_bad_model(mmmgpu, model, fault, tmp_path, world, out):
     assert list(out.iterdir()) == []
 
 
+@pytest.fixture
+def no_long_work(monkeypatch):
+    """An output is looked at before anything that takes long."""
+
+    def begin(*args, **kwargs):
+        raise AssertionError("the long work has begun")
+
+    for module, name in ((training, "train"), (reconstruction, "reconstruct")):
+        # defaults are still read from the real one's signature
+        monkeypatch.setattr(module, name, functools.wraps(getattr(module, name))(begin))
+    monkeypatch.setattr(aligner, "align_speech", begin)
+
+
 @pytest.mark.parametrize("command", ["train", "reconstruct", "align"])
-def test_output_below_a_file(mmmgpu, world, model, recording, command, tmp_path):
+def test_output_below_a_file(mmmgpu, world, model, recording, command, tmp_path, no_long_work):
     (tmp_path / "file").write_text("mine")
     out = tmp_path / "file" / "out.mkv"
     clip = world.clips[0]
@@ -322,7 +337,7 @@ def test_output_below_a_file(mmmgpu, world, model, recording, command, tmp_path)
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_output_folder_that_may_not_be_written(mmmgpu, world, out, monkeypatch):
+def test_output_folder_that_may_not_be_written(mmmgpu, world, out, monkeypatch, no_long_work):
     """Root may write anywhere, so the answer of the system is made up."""
     really_open = os.open
 
