@@ -1,4 +1,4 @@
-"""Analysis: the model coordinates of a real mouth image (DESIGN 5.7).
+"""Analysis: the model coordinates of a real mouth image (docs/model.md).
 
 alpha starts as the regularised least squares fit of the frame's flow,
 
@@ -99,8 +99,8 @@ def thumbnail(image: F32, mask: F32) -> F32:
     """A small masked copy of `image` (h, w, 3) as a vector, for comparing frames at a glance."""
     h, w = image.shape[:2]
     size = (THUMBNAIL, max(1, round(THUMBNAIL * h / w)))
-    small: F32 = cv2.resize(image * mask[..., None], size, interpolation=cv2.INTER_AREA)
-    return small.ravel()
+    small = cv2.resize(image * mask[..., None], size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32).ravel()
 
 
 def _tight(basis: Basis) -> tuple[Basis, tuple[slice, slice]]:
@@ -151,10 +151,10 @@ def _refine(analyzer: Analyzer, image: F32, alpha: Floats, made: F32) -> Floats:
     """
     basis = analyzer.basis
     mean = (made + image) / 2
-    slope_x, slope_y = cv2.Scharr(mean, -1, 1, 0) / 32, cv2.Scharr(mean, -1, 0, 1) / 32
+    slopes = [np.asarray(cv2.Scharr(mean, -1, *axis)) / 32 for axis in ((1, 0), (0, 1))]
     flow = basis.flow(alpha)
-    at = [_pulled(analyzer, field, flow) for field in (image - made, slope_x, slope_y)]
-    error, gx, gy = at
+    fields = [np.asarray(field, np.float32) for field in (image - made, *slopes)]
+    error, gx, gy = (_pulled(analyzer, field, flow) for field in fields)
     w = analyzer.weight / (1 + (error**2).sum(axis=1) / OUTLIER**2)
     xx, xy, yy = ((w * (a * b).sum(axis=1))[:, None] for a, b in ((gx, gx), (gx, gy), (gy, gy)))
     x, y = analyzer.along_x, analyzer.along_y
@@ -162,7 +162,8 @@ def _refine(analyzer: Analyzer, image: F32, alpha: Floats, made: F32) -> Floats:
     right = (w * (gx * error).sum(axis=1)) @ x + (w * (gy * error).sum(axis=1)) @ y
     ridge = STEP_RIDGE * float(np.trace(normal)) / len(normal)
     regular = normal.astype(np.float64) + ridge * np.eye(len(normal))
-    return alpha + cho_solve(cho_factor(regular), -right - ridge * alpha)
+    step: Floats = cho_solve(cho_factor(regular), -right - ridge * alpha)
+    return alpha + step
 
 
 def _pulled(analyzer: Analyzer, field: F32, flow: F32) -> F32:

@@ -24,7 +24,7 @@ def composite(
     The image is in the colours of the reference and is returned to those of the clip. Pixels that
     the cover does not reach keep their bits.
     """
-    own = (image - track.offset.astype(np.float32)) / track.gain.astype(np.float32)
+    own = np.asarray((image - track.offset) / track.gain, np.float32)
     box, placed, opacity = _place(own, cover, pose, region, frame.shape)
     return _over(frame, box, placed, opacity)
 
@@ -42,13 +42,13 @@ def composite_matched(
 
     What differs at the rim is fitted by a plane a + b x + c y per channel and added everywhere.
     """
-    own = (image - track.offset.astype(np.float32)) / track.gain.astype(np.float32)
+    own = np.asarray((image - track.offset) / track.gain, np.float32)
     box, placed, opacity = _place(own, cover, pose, region, frame.shape)
-    under = frame[box].astype(np.float32) / 255
+    under = np.asarray(frame[box] / np.float32(255), np.float32)
     rim = (opacity > RING[0]) & (opacity < RING[1])
     if rim.sum() >= 16:
-        placed = placed + _plane(under - placed, rim)
-        placed = placed + _grain(under, placed, rim, rng)
+        placed += _plane(under - placed, rim)
+        placed += _grain(under, placed, rim, rng)
     return _over(frame, box, placed, opacity)
 
 

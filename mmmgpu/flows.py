@@ -1,4 +1,4 @@
-"""Dense optical flow and its concatenation along paths of similar frames (EGP02, DESIGN 5.5).
+"""Dense optical flow and its concatenation along paths of similar frames (EGP02, docs/model.md).
 
 A flow a -> b, shape (H, W, 2) = (dx, dy) [px], says where the pixels of a are found in b. Direct
 flow fails where two pictures differ much; a path through pictures that resemble each other does

@@ -98,4 +98,4 @@ def project_on_simplex(beta: Floats) -> Floats:
     excess = np.cumsum(ranked, axis=1) - 1
     count = (ranked > excess / np.arange(1, beta.shape[1] + 1)).sum(axis=1)
     shift = excess[np.arange(len(beta)), count - 1] / count
-    return np.maximum(beta - shift[:, None], 0)
+    return np.asarray(np.maximum(beta - shift[:, None], 0))

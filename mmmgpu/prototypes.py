@@ -1,7 +1,7 @@
 """The choice of prototypes: PCA of the mouth, k-means, the real frame nearest to each centre.
 
 Frames are compared as small masked pictures ("thumbnails"); whitened PCA coordinates make the
-Euclidean distance of k-means the Mahalanobis distance (DESIGN 5.4, after EGP02).
+Euclidean distance of k-means the Mahalanobis distance (docs/model.md, after EGP02).
 """
 
 from collections.abc import Iterable, Sequence

@@ -56,6 +56,7 @@ def head_from_frame(frame: NDArray[np.uint8], mouth: Floats) -> Head:
 
 
 def to_gray(frame: NDArray[np.uint8]) -> Gray:
+    """The luma of an RGB frame, (H, W, 3) -> (H, W) uint8."""
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
@@ -120,7 +121,7 @@ def _like_patch(seen: Gray, head: Head) -> Gray:
     wanted_mean, wanted_deviation = _statistics(head.patch, head.mask)
     gain = np.clip(wanted_deviation / max(deviation, 1e-3), 1 / MOST_GAIN, MOST_GAIN)
     levels = np.clip(np.rint(gain * (np.arange(256) - mean) + wanted_mean), 0, 255)
-    return levels.astype(np.uint8)[seen]
+    return np.asarray(levels.astype(np.uint8)[seen])
 
 
 def _statistics(gray: Gray, mask: NDArray[np.float32]) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 phones -> trajectories (Eq. 3) -> frame rate of the background -> images (Eq. 1-2) -> composite
 """
 
+import math
 import os
 from collections.abc import Iterator
 from fractions import Fraction
@@ -77,7 +78,7 @@ def plan(model: Model, alignment: Alignment, *, articulation: float = 1.0) -> Tr
     """
     if not ARTICULATION[0] <= articulation <= ARTICULATION[1]:
         raise InputError(f"articulation must be between 0.5 and 1.5, got {articulation}")
-    frames = max(1, int(np.ceil(alignment.duration * model.fps - 1e-6)))
+    frames = max(1, math.ceil(alignment.duration * float(model.fps) - 1e-6))
     labels = frame_labels(alignment, frames, float(model.fps))
     alpha, beta = (
         scale_about(y, neutral, articulation)
@@ -111,7 +112,7 @@ def at_rate(trajectory: Trajectory, fps: Fraction) -> Trajectory:
     """`trajectory` at another frame rate: linear between the middles of its frames."""
     if fps == trajectory.fps:
         return trajectory
-    length = max(1, int(np.ceil(len(trajectory) / trajectory.fps * fps - Fraction(1, 10**6))))
+    length = max(1, math.ceil(len(trajectory) / trajectory.fps * fps - Fraction(1, 10**6)))
     middle = (np.arange(length) + 0.5) * float(trajectory.fps / fps) - 0.5
     here = np.arange(len(trajectory))
     alpha, beta = (

@@ -36,7 +36,7 @@ def synthesize_one(basis: Basis, alpha: Floats, beta: Floats, kernels: Backend) 
     used = np.flatnonzero(beta > NO_TEXTURE)
     warped = warp_prototypes(basis, basis.flow(alpha), used, kernels)
     weights = kernels.to_device((beta[used] / beta[used].sum()).astype(np.float32)[None])
-    return np.clip(kernels.to_host(kernels.blend(warped, weights))[0], 0, 1)
+    return np.asarray(np.clip(kernels.to_host(kernels.blend(warped, weights))[0], 0, 1))
 
 
 def warp_prototypes(

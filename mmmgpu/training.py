@@ -1,4 +1,4 @@
-"""Training: from clips and their alignments to a model (EGP02, DESIGN 5), streaming and resumable.
+"""Training: from clips and their alignments to a model, streaming and resumable (docs/model.md).
 
 The steps: find the mouth, track every clip, choose prototypes, compute their flows, analyse every
 frame, train the phoneme models. What each step finds for a clip is kept in a folder beside the

@@ -1,7 +1,19 @@
+import signal
+
+import hypothesis
 import pytest
 from worlds import make_postures, make_world
 
 from mmmgpu.backends import BACKENDS, get_backend
+
+
+hypothesis.settings.register_profile("busy", deadline=None)  # timing is not what is tested
+hypothesis.settings.load_profile("busy")
+
+
+def pytest_configure(config):
+    """Let Ctrl-C work where the shell has started us with it ignored, as behind an `&`."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser):
