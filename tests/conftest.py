@@ -6,7 +6,6 @@ from worlds import make_postures, make_world
 
 from mmmgpu.backends import BACKENDS, get_backend
 
-
 hypothesis.settings.register_profile("busy", deadline=None)  # timing is not what is tested
 hypothesis.settings.load_profile("busy")
 
