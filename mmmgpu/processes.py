@@ -63,7 +63,7 @@ def _start(
         [sys.executable, "-m", "mmmgpu.processes"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        env={**os.environ, **ONE_THREAD},
+        env={**os.environ, **ONE_THREAD, **_same_modules()},
         start_new_session=True,  # Ctrl-C is the parent's business, which ends its children
     )
     assert child.stdin is not None
@@ -73,6 +73,11 @@ def _start(
     except BrokenPipeError:
         pass  # it died at once; `_watch` says so
     return child
+
+
+def _same_modules() -> dict[str, str]:
+    """A child imports from where we do, and never from the folder that it happens to run in."""
+    return {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "PYTHONSAFEPATH": "1"}
 
 
 def _watch(children: Sequence[subprocess.Popen[bytes]], advance: Callable[[int], None]) -> None:

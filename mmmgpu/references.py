@@ -19,7 +19,14 @@ from mmmgpu.regions import (
     shrink,
     speech_motion,
 )
-from mmmgpu.registration import Head, head_from_frame, project, register, to_gray
+from mmmgpu.registration import (
+    MINIMUM_CORRELATION,
+    Head,
+    head_from_frame,
+    project,
+    register,
+    to_gray,
+)
 from mmmgpu.sounds import energy, read_sound
 from mmmgpu.tracks import Reference, Track, frame_at, make_reference
 from mmmgpu.videos import read_frames
@@ -28,42 +35,67 @@ Floats = NDArray[np.float64]
 
 SEARCH_CLIPS = 6  # clips in which the mouth is looked for
 SEARCH_FRAMES = 150  # frames of each
+GLANCE_FRAMES = 5  # frames that tell whether a clip shows the head of another
 REFINED_WIDTH = 32  # [px] width of the mouth in the stabilised pictures of the second look
 
 
 def find_reference(
     corpus: Sequence[Clip], box: tuple[int, int, int, int] | None, *, sync: float = 0.0
 ) -> Reference:
-    """A provisional reference: the first frame of the middle clip and the mouth found around it.
+    """A provisional reference: the first frame of a clip and the mouth found around it.
 
-    box: the region (x, y, width, height) [px] in that frame, where a person gave it.
+    It is the middle clip, unless its head is not found again in most clips of a sample: then the
+    next one of the sample, and so on.
+
+    box: the region (x, y, width, height) [px] in the middle clip, where a person gave it.
 
     Raises:
         InputError: Nothing moves with the sound, or there is no sound; `box` leaves the frame.
     """
     middle = corpus[len(corpus) // 2]
-    frame = frame_at(middle.path, 0)
-    size = (middle.info.width, middle.info.height)
     if box is not None:
-        region = region_from_box(box, size)
-    else:
-        region = region_around(_find_mouth(corpus, frame, sync), size)
-    return make_reference(frame, head_from_frame(frame, np.array(region.mouth)), region)
+        region = region_from_box(box, (middle.info.width, middle.info.height))
+        frame = frame_at(middle.path, 0)
+        return make_reference(frame, head_from_frame(frame, np.array(region.mouth)), region)
+    sample = [corpus[i] for i in _spread(len(corpus), SEARCH_CLIPS)]
+    references = []
+    for clip in [middle, *sample]:
+        reference, seen = _reference_from(clip, sample, sync)
+        if 2 * len(seen) > len(sample):
+            # clips that do not show this head have misled the search
+            return reference if seen == sample else _reference_from(clip, seen, sync)[0]
+        references.append(reference)
+    return references[0]
 
 
-def _find_mouth(
-    corpus: Sequence[Clip], frame: NDArray[np.uint8], sync: float
-) -> tuple[float, float, float]:
-    """(x, y, width) [px] in `frame`: first in the raw picture, then in the stabilised one."""
-    some = [corpus[i] for i in _spread(len(corpus), SEARCH_CLIPS)]
+def _reference_from(
+    clip: Clip, sample: Sequence[Clip], sync: float
+) -> tuple[Reference, list[Clip]]:
+    """A reference from `clip` and the clips of `sample` in which its head is found."""
+    frame = frame_at(clip.path, 0)
+    mouth = _find_mouth(sample, sync)
+    head = head_from_frame(frame, np.array(mouth))
+    seen = [other for other in sample if _shows(other, head)]
+    x, y = _second_look(seen or sample, head, np.array(mouth), sync)
+    region = region_around((x, y, mouth[2]), (clip.info.width, clip.info.height))
+    head = head_from_frame(frame, np.array(region.mouth))
+    return make_reference(frame, head, region), seen
+
+
+def _shows(clip: Clip, head: Head) -> bool:
+    """Whether `head` is found in the first frames of `clip`."""
+    frames = islice(read_frames(clip.path), GLANCE_FRAMES)
+    return all(score >= MINIMUM_CORRELATION for _, score in register(frames, head))
+
+
+def _find_mouth(sample: Sequence[Clip], sync: float) -> tuple[float, float, float]:
+    """(x, y, width) [px] of the mouth in the raw pictures of all clips together."""
     total, scale = np.zeros(0, np.float32), 1.0
-    for clip in some:
+    for clip in sample:
         small, scale = shrink(islice(read_frames(clip.path), SEARCH_FRAMES))
         motion = speech_motion(small, _energy(clip, len(small), sync))
         total = motion if not total.size else total + _fit(motion, total.shape)
     x, y, width = (value / scale for value in locate_mouth(total))
-    head = head_from_frame(frame, np.array([x, y, width]))
-    x, y = _second_look(some, head, np.array([x, y, width]), sync)
     return x, y, width
 
 

@@ -4,7 +4,6 @@ Pictures and small videos lie inside it. It reads well on a phone, in the light 
 says in plain words what every picture shows.
 """
 
-import base64
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -20,62 +19,24 @@ from mmmgpu.figures import (
     curves,
     enlarged,
     flow_arrows,
-    jpeg_uri,
     learning_curve,
     outlined,
     seen_through,
-    to_bytes,
 )
 from mmmgpu.files import write_text
 from mmmgpu.models import Model, project_on_simplex, trajectories
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phones import SIL, VISEMES, arpabet
+from mmmgpu.report_parts import PAGE, figure, pair, picture, small, tile, video
 from mmmgpu.report_tables import error_table, fact_table, lip_table, picture_table
 from mmmgpu.synthesis import synthesize_one
-from mmmgpu.tracks import frame_at
 from mmmgpu.trajectory_files import Trajectory
-from mmmgpu.videos import probe
 
 Floats = NDArray[np.float64]
 
-LARGEST_VIDEO = 4_000_000  # bytes of a video that is put into the report; larger ones are linked
 LARGEST_ARROWS = 360  # [px] width of a picture with arrows
-LARGEST_TILE = 150  # [px] height of a small picture
 FLOWS_SHOWN, CHANGES_SHOWN, STILLS_SHOWN = 6, 8, 12
 OUTLINES = (("w_f", (255, 210, 60)), ("w_t", (90, 200, 255)), ("cover", (255, 255, 255)))
-
-PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-:root {{ color-scheme: light dark; --line: #8885; --back: #8881; }}
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 0 auto; padding: 1rem; }}
-h1 {{ font-size: 1.6rem; }} h2 {{ font-size: 1.25rem; margin-top: 2.5rem; }}
-figure {{ margin: 1rem 0; }} figcaption {{ font-size: .85rem; opacity: .85; }}
-img, video {{ max-width: 100%; height: auto; border-radius: 4px; display: block; }}
-.tiles {{ display: grid; gap: .6rem; grid-template-columns: repeat(auto-fill, minmax(92px, 1fr)); }}
-.tiles.wide {{ grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); }}
-.tiles.middle {{ grid-template-columns: repeat(auto-fit, minmax(110px, 14rem)); }}
-.tiles figure {{ margin: 0; }} .tiles img {{ width: 100%; }}
-.tiles figcaption {{ text-align: center; font-size: .75rem; }}
-.pair {{ display: flex; gap: 2px; }} .pair img {{ width: 50%; }}
-.chosen img {{ outline: 3px solid #d9730d; }}
-.scroll {{ overflow-x: auto; }} .scroll svg {{ min-width: 680px; width: 100%; height: auto; }}
-.small svg {{ max-width: 34rem; width: 100%; height: auto; }}
-table {{ border-collapse: collapse; font-size: .9rem; }}
-th, td {{ padding: .3rem .7rem; border-bottom: 1px solid var(--line); text-align: left; }}
-td.n, th.n {{ text-align: right; font-variant-numeric: tabular-nums; }}
-.better {{ font-weight: 600; }}
-</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""
 
 
 def write_report(
@@ -155,23 +116,7 @@ def _summary(model: Model) -> str:
 def _videos(videos: Mapping[str, Path], page: Path) -> str:
     if not videos:
         return ""
-    return "<h2>Videos</h2>" + "".join(_video(c, v, page) for c, v in videos.items())
-
-
-def _video(caption: str, path: Path, page: Path) -> str:
-    link = escape(Path(os.path.relpath(path, page.parent)).as_posix())
-    text = f'<figcaption>{escape(caption)} (<a href="{link}">{escape(path.name)}</a>)</figcaption>'
-    data = path.read_bytes()
-    if len(data) > LARGEST_VIDEO or path.suffix.lower() != ".mp4":
-        return f"<figure>{text}</figure>"
-    address = "data:video/mp4;base64," + base64.b64encode(data).decode()
-    poster = jpeg_uri(frame_at(path, probe(path).frames // 2))
-    label = escape(caption)
-    player = (
-        f'<video controls playsinline poster="{poster}" src="{address}" aria-label="{label}">'
-        "</video>"
-    )
-    return f"<figure>{player}{text}</figure>"
+    return "<h2>Videos</h2>" + "".join(video(c, v, page) for c, v in videos.items())
 
 
 def _reference(model: Model) -> str:
@@ -183,7 +128,7 @@ def _reference(model: Model) -> str:
     image = basis.images[basis.reference]
     words = ("flows are compared here", "textures are compared here", "this much is put on a video")
     parts = [
-        _tile(seen_through(image, mask), f"{name}: {use}")
+        tile(seen_through(image, mask), f"{name}: {use}")
         for (mask, _), (name, _), use in zip(masks, OUTLINES, words, strict=True)
     ]
     name, t = model.sources[basis.reference]
@@ -191,7 +136,7 @@ def _reference(model: Model) -> str:
         "<h2>The reference</h2><p>One calm frame is the reference "
         f"(frame {t} of {escape(name)}): every other mouth is described as this one moved. "
         "The masks say where.</p>"
-        + _figure(picture, "The reference with the half-way lines of the lip mask w_f (yellow), "
+        + figure(picture, "The reference with the half-way lines of the lip mask w_f (yellow), "
                   "the mouth mask w_t (blue) and the cover (white).")
         + f'<div class="tiles middle">{"".join(parts)}</div>'
     )  # fmt: skip
@@ -199,7 +144,7 @@ def _reference(model: Model) -> str:
 
 def _prototypes(model: Model) -> str:
     tiles = "".join(
-        _tile(
+        tile(
             image,
             f"{i}" + (" (reference)" if i == model.basis.reference else ""),
             alt=f"prototype {i}: frame {t} of {name}",
@@ -220,7 +165,7 @@ def _flows(model: Model) -> str:
     origin = basis.images[basis.reference]
     scale = max(1, round(LARGEST_ARROWS / origin.shape[1]))
     tiles = "".join(
-        _pair(
+        pair(
             flow_arrows(origin, basis.flows[i], scale=scale),
             enlarged(basis.images[i], scale),
             (f"arrows of flow {i} on the reference", f"prototype {i}"),
@@ -237,7 +182,7 @@ def _flows(model: Model) -> str:
 
 def _visemes(model: Model, backend: str) -> str:
     tiles = "".join(
-        _tile(
+        tile(
             image,
             f"{label} · {count}",
             alt=f"the mouth in the middle of {label}, learned from {count} frames",
@@ -280,9 +225,9 @@ def _training(model: Model, backend: str) -> str:
     change = np.linalg.norm(alpha.trained.mean - alpha.pooled.mean, axis=1)
     labels = [alpha.trained.labels[i] for i in np.argsort(-change)[:CHANGES_SHOWN]]
     pairs = "".join(
-        _pair(
-            _tile_sized(_mean_picture(model, label, backend, trained=False)),
-            _tile_sized(_mean_picture(model, label, backend, trained=True)),
+        pair(
+            small(_mean_picture(model, label, backend, trained=False)),
+            small(_mean_picture(model, label, backend, trained=True)),
             (f"{label} before training", f"{label} after training"),
             f"{label}: before, after",
         )
@@ -372,7 +317,7 @@ def _stills(model: Model, spoken: Trajectory, backend: str) -> str:
     ]
     kernels = get_backend(backend)
     tiles = "".join(
-        _tile(
+        tile(
             synthesize_one(model.basis, spoken.alpha[t], spoken.beta[t], kernels),
             f"{spoken.labels[t]} {float(t / spoken.fps):.2f} s",
         )
@@ -390,30 +335,3 @@ def _middles(labels: Sequence[str]) -> list[int]:
     runs = list(zip(starts, [*starts[1:], len(labels)], strict=True))
     said = [(a, b) for a, b in runs if labels[a] != SIL] or runs
     return [(a + b) // 2 for a, b in said]
-
-
-def _tile_sized(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """At most `LARGEST_TILE` pixels high."""
-    share = LARGEST_TILE / image.shape[0]
-    return enlarged(image, share) if share < 1 else to_bytes(image)
-
-
-def _tile(image: NDArray[Any], caption: str, *, alt: str = "", marked: bool = False) -> str:
-    kind = ' class="chosen"' if marked else ""
-    shown = _img(_tile_sized(image), alt or caption)
-    return f"<figure{kind}>{shown}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _pair(left: NDArray[Any], right: NDArray[Any], alts: tuple[str, str], caption: str) -> str:
-    """Two pictures beside each other with one caption."""
-    shown = _img(left, alts[0]) + _img(right, alts[1])
-    text = f"<figcaption>{escape(caption)}</figcaption>"
-    return f'<figure><div class="pair">{shown}</div>{text}</figure>'
-
-
-def _figure(image: NDArray[Any], caption: str) -> str:
-    return f"<figure>{_img(image, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _img(image: NDArray[Any], alt: str) -> str:
-    return f'<img src="{jpeg_uri(image)}" alt="{escape(alt)}">'

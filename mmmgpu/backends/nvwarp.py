@@ -49,9 +49,18 @@ def list_devices() -> dict[str, str]:
     return {f"warp:{d.alias}": f"{d.name}, Warp {wp.__version__}" for d in wp.get_devices()}
 
 
+@functools.cache
 def _start() -> None:
-    wp.config.log_level = wp.LOG_ERROR  # Warp would print its banner to stdout
-    cast(Any, wp).init()
+    """Start Warp without its banner, and without its native warning where there is no CUDA."""
+    wp.config.log_level = wp.LOG_ERROR
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 2)
+        cast(Any, wp).init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
 
 
 def _keep_freed_memory() -> None:
