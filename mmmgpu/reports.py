@@ -27,7 +27,7 @@ from mmmgpu.files import write_text
 from mmmgpu.models import Model, project_on_simplex, trajectories
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phones import SIL, VISEMES, arpabet
-from mmmgpu.report_parts import PAGE, figure, pair, picture, small, tile, video
+from mmmgpu.report_parts import PAGE, figure, pair, small, tile, video
 from mmmgpu.report_tables import error_table, fact_table, lip_table, picture_table
 from mmmgpu.synthesis import synthesize_one
 from mmmgpu.trajectory_files import Trajectory
@@ -124,7 +124,7 @@ def _reference(model: Model) -> str:
     frame = model.prototype_frames[basis.reference]
     masks = [(getattr(basis, name), colour) for name, colour in OUTLINES]
     scale = 2 if frame.shape[0] <= 400 else 1
-    picture = outlined(frame, masks, basis.region.box[:2], scale=scale)
+    drawn = outlined(frame, masks, basis.region.box[:2], scale=scale)
     image = basis.images[basis.reference]
     words = ("flows are compared here", "textures are compared here", "this much is put on a video")
     parts = [
@@ -136,7 +136,7 @@ def _reference(model: Model) -> str:
         "<h2>The reference</h2><p>One calm frame is the reference "
         f"(frame {t} of {escape(name)}): every other mouth is described as this one moved. "
         "The masks say where.</p>"
-        + figure(picture, "The reference with the half-way lines of the lip mask w_f (yellow), "
+        + figure(drawn, "The reference with the half-way lines of the lip mask w_f (yellow), "
                   "the mouth mask w_t (blue) and the cover (white).")
         + f'<div class="tiles middle">{"".join(parts)}</div>'
     )  # fmt: skip
