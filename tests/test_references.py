@@ -113,6 +113,15 @@ def test_a_rebased_reference_sees_its_own_frame_at_the_identity(world, found, ke
         np.testing.assert_allclose(shift, carried - old_mouth[:2], atol=0.51)
 
 
+def test_a_rebased_reference_has_the_colours_of_its_own_clip(world, found):
+    track = track_clip(world.clips[0], found)
+    gain, offset = np.array([1.2, 0.9, 1.0]), np.array([0.1, 0.0, -0.05])
+    other = replace(track, gain=gain, offset=offset)  # as if the clip had another exposure
+    new = rebase_reference(found, other, 3, (144, 160), keep_box=False)
+    np.testing.assert_allclose(gain * new.colours + offset, found.colours, atol=1e-6)
+    assert new.colours.dtype == np.float32
+
+
 def test_a_kept_box_stays_in_the_picture(world, corpus):
     reference = find_reference(corpus, (84, 100, 60, 60))  # touches two edges
     track = track_clip(world.clips[0], reference)

@@ -129,6 +129,13 @@ def test_what_moves_without_the_sound_is_not():
     assert motion[50:62, 22:42].sum() > 0.8
 
 
+def test_blinks_of_a_speaker_are_not_the_mouth():
+    """They come while there is sound, are stronger than the lips' motion, but short."""
+    pictures, energy = moving_picture(np.random.default_rng(0), blinks=(12, 18, 70))
+    motion = speech_motion(list(pictures), energy)
+    assert motion[50:62, 22:42].sum() > 0.85
+
+
 def test_a_still_picture_has_no_mouth():
     still = [np.full((40, 30), 90, np.uint8)] * 20
     motion = speech_motion(still, np.linspace(0, 1, 20))

@@ -8,6 +8,7 @@ from mmmgpu.performer import landmarks, performer, render
 from mmmgpu.performer_articulation import ARTICULATORS, REST, Articulation
 from mmmgpu.registration import (
     MINIMUM_CORRELATION,
+    PATCH_UNIT,
     TEMPORAL_SMOOTHNESS,
     head_from_frame,
     project,
@@ -116,11 +117,43 @@ def test_poses_do_not_follow_the_mouth():
     assert misses([pose], [np.eye(3)], mouth).max() < 0.4
 
 
+def test_the_mask_holds_the_upper_face_and_not_the_mouth(still):
+    frame, mouth = still
+    head = head_from_frame(frame, mouth)
+    x, y, width = mouth
+    there = np.linalg.inv(head.to_frame)
+
+    def weight(across, down):
+        u, v = project(there, np.array([[x + across * width, y + down * width]]))[0]
+        return head.mask[round(v), round(u)]
+
+    assert weight(0, -1.3) == weight(0.4, -1.3) == weight(-0.4, -1.6) == 1
+    assert weight(0, -0.35) == weight(1.3, -1.3) == weight(0, -2.5) == 0
+    assert head.mask.min() == 0
+    assert head.mask.max() == 1
+
+
+def test_what_covers_a_part_of_the_face_is_not_followed(still):
+    """A finger that rests before one eye while the head moves on."""
+    frame, mouth = still
+    truth = [about(mouth, shift=(t, t / 2)) for t in range(8)]
+    frames = [seen_by(frame, p) for p in truth]
+    x, y, width = mouth
+    top, left = round(y - 1.9 * width), round(x + 0.2 * width)
+    patch = (255 * texture(round(0.5 * width), round(0.7 * width), grain=1.5)).astype(np.uint8)
+    for seen in frames:
+        seen[top : top + patch.shape[0], left : left + patch.shape[1]] = patch
+    poses, _ = zip(*register(frames, head_from_frame(frames[0], mouth)), strict=True)
+    miss = misses(poses, truth, mouth)
+    assert np.median(miss) < 0.25
+    assert miss.max() < 1.5
+
+
 def test_a_large_head_is_registered_in_a_smaller_patch(still):
     frame, mouth = still
     large = cv2.resize(frame, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
     head = head_from_frame(large, 3 * mouth)
-    assert head.patch.shape[0] < large.shape[0] / 1.5
+    assert head.patch.shape == (round(2.7 * PATCH_UNIT), round(3.4 * PATCH_UNIT))
     assert head.mask.shape == head.patch.shape
     truth = [about(3 * mouth, shift=(2 * t, -t), turn=0.01 * t) for t in range(6)]
     poses, _ = zip(*register([seen_by(large, p) for p in truth], head), strict=True)
@@ -212,6 +245,7 @@ def test_poses_that_are_not_trusted_do_not_matter():
     trusted[[0, 10, 11, 12, 29]] = False
     wild = poses.copy()
     wild[~trusted] = np.diag([3.0, -2.0, 1.0])
+    wild[11] = np.nan  # of a frame without any picture
     got, again = (smooth_poses(p, trusted, CORNERS) for p in (poses, wild))
     np.testing.assert_array_equal(got, again)
     miss = [

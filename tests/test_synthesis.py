@@ -5,7 +5,7 @@ import oracles_model as oracles
 import pytest
 
 from mmmgpu.backends import get_backend
-from mmmgpu.synthesis import synthesize, synthesize_one
+from mmmgpu.synthesis import NO_TEXTURE, synthesize, synthesize_one
 
 ALL = ("numpy", "warp", "opencl")
 
@@ -63,10 +63,23 @@ def test_prototypes_without_texture_do_not_matter(basis, name):
         )
 
 
+def test_prototypes_without_texture_cost_nothing(basis, monkeypatch):
+    kernels = get_backend("numpy")
+    warp, sizes = type(kernels).forward_warp, []
+
+    def counted(self, field, flow):
+        sizes.append(len(field))
+        return warp(self, field, flow)
+
+    monkeypatch.setattr(type(kernels), "forward_warp", counted)
+    synthesize_one(basis, np.zeros(4), np.array([0.5, 0, 0, 0.5, 0]), kernels)
+    assert sizes == [2, 2]
+
+
 def test_textures_that_cannot_be_seen_cost_no_brightness(basis):
     kernels = get_backend("numpy")
     alpha, _ = coordinates(basis)
-    beta = np.full(len(basis.images), 1e-9)
+    beta = np.full(len(basis.images), 0.99 * NO_TEXTURE)
     beta[0] = 1 - beta[1:].sum()
     only = np.eye(len(basis.images))[0]
     np.testing.assert_array_equal(
