@@ -21,6 +21,7 @@ from mmmgpu.video_writing import write_video
 from mmmgpu.videos import probe, read_frames
 
 Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,12 @@ def reconstructed_frames(
     model: Model, clip: Path, analysed: Analysed, *, backend: str = "warp"
 ) -> Iterator[NDArray[np.uint8]]:
     """The frames of `clip` with the mouth that the model makes of its coordinates."""
-    kernels, basis, track = get_backend(backend), model.basis, analysed.track
-    rows = zip(read_frames(clip), track.poses, analysed.alpha, analysed.beta, strict=False)
-    for frame, pose, alpha, beta in rows:
+    kernels, basis, track = get_backend(backend, 1), model.basis, analysed.track
+
+    def one(item: tuple[Picture, Floats, Floats, Floats], _: Cancelled) -> Picture:
+        frame, pose, alpha, beta = item
         image = synthesize_one(basis, alpha, beta, kernels)
-        yield composite(frame, image, basis.cover, pose, track, basis.region)
+        return composite(frame, image, basis.cover, pose, track, basis.region)
+
+    rows = zip(read_frames(clip), track.poses, analysed.alpha, analysed.beta, strict=False)
+    yield from map_ordered(one, rows, threads=default_threads())

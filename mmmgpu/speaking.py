@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.alignments import Alignment, frame_labels
-from mmmgpu.backends import get_backend
+from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.backgrounds import Background, extended, open_background
 from mmmgpu.compositing import composite_matched
 from mmmgpu.errors import InputError
 from mmmgpu.models import Model, project_on_simplex, trajectories
-from mmmgpu.parallel import one_thread_each
+from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.phones import SIL
 from mmmgpu.progress import progress
 from mmmgpu.synthesis import synthesize_one
@@ -27,6 +27,7 @@ from mmmgpu.video_writing import write_video
 from mmmgpu.voices import Speech
 
 Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 
 ARTICULATION = (0.5, 1.5)  # least and most
 FAINT = 0.02  # taken off every beta: faint textures blur the teeth and cost time
@@ -148,11 +149,15 @@ def spoken_frames(
     model: Model, trajectory: Trajectory, background: Background, *, backend: str = "warp"
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield the frames of a trajectory on a background of the same frame rate."""
-    kernels, basis, track = get_backend(backend), model.basis, background.track
-    pictures = extended(background, len(trajectory))
-    numbered = progress(pictures, "render", total=len(trajectory))
-    for i, (frame, t) in enumerate(numbered):
+    kernels, basis, track = get_backend(backend, 1), model.basis, background.track
+
+    def one(item: tuple[int, tuple[Picture, int]], _: Cancelled) -> Picture:
+        i, (frame, t) = item
         image = synthesize_one(basis, trajectory.alpha[i], trajectory.beta[i], kernels)
         rng = np.random.default_rng([i, len(trajectory)])
         pose = track.poses[t]
-        yield composite_matched(frame, image, basis.cover, pose, track, basis.region, rng)
+        return composite_matched(frame, image, basis.cover, pose, track, basis.region, rng)
+
+    pictures = enumerate(extended(background, len(trajectory)))
+    frames = map_ordered(one, pictures, threads=default_threads())
+    yield from progress(frames, "render", total=len(trajectory))
