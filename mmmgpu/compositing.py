@@ -12,7 +12,7 @@ F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-MOST_GRAIN = 4 / 255  # standard deviation of added grain, at most
+MOST_GRAIN = 2.5 / 255  # standard deviation of added grain, at most
 RING = (0.02, 0.6)  # cover in which model and background are compared
 
 
@@ -100,7 +100,7 @@ def _plane(difference: F32, rim: NDArray[np.bool_]) -> F32:
 def _grain(under: F32, placed: F32, rim: NDArray[np.bool_], rng: np.random.Generator) -> F32:
     """Noise (h, w, 1) that gives `placed` the fine texture that the frame has at the rim."""
     fine = [g - cv2.GaussianBlur(g, (0, 0), 1.0) for g in (under.mean(-1), placed.mean(-1))]
-    missing = float(np.var(fine[0][rim]) - np.var(fine[1][rim]))
-    strength = min(np.sqrt(max(missing, 0.0)), MOST_GRAIN)
+    deviation = [1.4826 * float(np.median(np.abs(f[rim]))) for f in fine]  # edges do not count
+    strength = min(np.sqrt(max(deviation[0] ** 2 - deviation[1] ** 2, 0.0)), MOST_GRAIN)
     noise = cv2.GaussianBlur(rng.standard_normal(rim.shape).astype(np.float32), (0, 0), 0.5)
     return np.asarray(strength * noise / max(float(noise.std()), 1e-6), np.float32)[..., None]
