@@ -18,6 +18,7 @@ from mmmgpu.regions import (
     region_from_box,
     shrink,
     speech_motion,
+    width_from_eyes,
 )
 from mmmgpu.registration import (
     MINIMUM_CORRELATION,
@@ -35,6 +36,8 @@ Floats = NDArray[np.float64]
 
 SEARCH_CLIPS = 6  # clips in which the mouth is looked for
 SEARCH_FRAMES = 150  # frames of each
+CHIN_PULL = 0.12  # mouth widths by which the chin's motion draws the first guess down
+EYES_TRUST = 0.87  # of the width that the eyes suggest, the mouth is at least so much
 GLANCE_FRAMES = 5  # frames that tell whether a clip shows the head of another
 REFINED_WIDTH = 32  # [px] width of the mouth in the stabilised pictures of the second look
 
@@ -73,7 +76,9 @@ def _reference_from(
 ) -> tuple[Reference, list[Clip]]:
     """A reference from `clip` and the clips of `sample` in which its head is found."""
     frame = frame_at(clip.path, 0)
-    mouth = _find_mouth(sample, sync)
+    x, y, width = _find_mouth(sample, sync)
+    seen_wide = width_from_eyes(to_gray(frame), (x, y - CHIN_PULL * width, width))
+    mouth = (x, y, max(width, EYES_TRUST * seen_wide))
     head = head_from_frame(frame, np.array(mouth))
     seen = [other for other in sample if _shows(other, head)]
     x, y = _second_look(seen or sample, head, np.array(mouth), sync)

@@ -6,6 +6,7 @@ while there is none; blinks and head motion do not care about the sound.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 SEARCH_WIDTH = 256  # [px] longer side of the picture in which the mouth is looked for
+_UNIT = 40.0  # [px] width of a mouth in the picture in which eyes are looked for
 SPREAD_TO_WIDTH = 1.15  # the moving area holds 80 % of its motion in this many mouth widths
 
 # The region in mouth widths from the centre of the mouth; the masks end in soft edges inside it.
@@ -155,12 +157,45 @@ def locate_mouth(motion: F32) -> tuple[float, float, float]:
     return cx, cy, float(right - left) / SPREAD_TO_WIDTH
 
 
+def width_from_eyes(gray: NDArray[np.uint8], mouth: Sequence[float]) -> float:
+    """The width of the mouth [px] that fits the eyes above it, in a grey picture.
+
+    A mouth that opens in its middle seems narrower than it is; eyes do not care. They are two dark,
+    edged places at (+-0.62, -1.55) mouth widths from the mouth, above cheeks that are neither. They
+    are looked for around the width of `mouth` (x, y, width) [px].
+    """
+    scale = _UNIT / mouth[2]
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    picture = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 0.03 * _UNIT)
+    dark = np.maximum(cv2.GaussianBlur(picture, (0, 0), 0.5 * _UNIT) - picture, 0)
+    eyelike = np.sqrt(np.abs(cv2.Scharr(picture, -1, 0, 1)) / 32 * dark)
+    x, y = mouth[0] * scale, mouth[1] * scale
+    widths = _UNIT * np.geomspace(0.65, 1.7, 40)
+    scores = []
+    for s in widths:
+        eyes = [_around(eyelike, x + side * s, y - 1.55 * s, 0.17 * s) for side in (-0.62, 0.62)]
+        cheeks = [_around(eyelike, x + side * s, y - 0.85 * s, 0.2 * s) for side in (-0.55, 0.55)]
+        likely = -0.15 * (np.log(s / _UNIT) / 0.35) ** 2
+        scores.append(np.log1p(min(eyes)) - np.log1p(np.mean(cheeks)) + likely)
+    return float(widths[int(np.argmax(scores))]) / scale
+
+
+def _around(field: NDArray[Any], x: float, y: float, reach: float) -> float:
+    """Mean of `field` around (x, y) under a Gaussian; 0 outside the picture."""
+    h, w = field.shape
+    if not (0 <= x < w and 0 <= y < h):
+        return 0.0
+    across = np.exp(-((np.arange(w) - x) ** 2) / (2 * reach**2))
+    down = np.exp(-((np.arange(h) - y) ** 2) / (2 * reach**2))
+    return float(down @ field @ across / (down.sum() * across.sum()))
+
+
 def refine_centre(motion: F32, width: float) -> tuple[float, float]:
     """(x, y) of the mouth in a map of a stabilised picture, starting from its centre [px]."""
     h, w = motion.shape
     x, y = np.arange(w) - (w - 1) / 2, np.arange(h)[:, None] - (h - 1) / 2
     cx = cy = 0.0
-    for reach in (0.8, 0.7, 0.6, 0.55, 0.55, 0.55):
+    for reach in (0.4,) * 6:  # collars and necks move with the sound as well
         across, down = 1.1 * reach * width, 0.8 * reach * width
         share = motion * np.exp(-((x - cx) ** 2) / (2 * across**2))
         share = share * np.exp(-((y - cy) ** 2) / (2 * down**2))

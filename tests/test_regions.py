@@ -16,7 +16,9 @@ from mmmgpu.regions import (
     region_from_box,
     shrink,
     speech_motion,
+    width_from_eyes,
 )
+from mmmgpu.videos import read_frames
 
 MASKS = {"cover": cover_mask, "lip": lip_mask, "mouth": mouth_mask}
 
@@ -170,3 +172,13 @@ def test_shrunk_frames_are_grey_and_of_the_search_size():
     assert small[0].shape == (SEARCH_WIDTH, round(512 * SEARCH_WIDTH / 600))
     assert scale == SEARCH_WIDTH / 600
     assert small[0].mean() == pytest.approx(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).mean(), abs=1)
+
+
+def test_the_eyes_tell_the_width_of_the_mouth_from_a_wrong_guess(world):
+    frame = next(iter(read_frames(world.clips[0])))
+    lips = landmarks(world.face, world.motions[0], 0)[:20]
+    x, y = lips.mean(axis=0)
+    true = np.ptp(lips[:, 0])
+    for guess in (0.75, 1.0, 1.3):
+        found = width_from_eyes(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (x, y, guess * true))
+        assert 0.85 * true < found < 1.35 * true
