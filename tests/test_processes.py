@@ -1,0 +1,142 @@
+import contextlib
+import os
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from mmmgpu.errors import InputError
+from mmmgpu.processes import share_out
+
+WAIT_S = 60  # at most, for another process
+
+
+def counting(folder):
+    """Leave one file an item, with as many ticks as it says."""
+    prepared = Path(folder) / f"prepared {os.getpid()}"
+    prepared.touch(exist_ok=False)
+
+    def work(item, tick):
+        print("this must not pass for an answer ...!")
+        name, ticks = item
+        (Path(folder) / name).touch(exist_ok=False)
+        for _ in range(ticks):
+            tick()
+
+    return work
+
+
+def failing(fail, folder):
+    """The first item waits for the second to have begun, and fails; the second never ends."""
+
+    def work(item, _):
+        begun = Path(folder) / "pid"
+        if item == "endless":
+            begun.with_suffix(".part").write_text(str(os.getpid()))
+            begun.with_suffix(".part").replace(begun)
+            time.sleep(10 * WAIT_S)
+        end = time.monotonic() + WAIT_S
+        while not begun.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        fail()
+
+    return work
+
+
+def refuse():
+    raise InputError("clip ü.mp4: is odd!; leave it out.")
+
+
+def die():
+    os._exit(7)
+
+
+def break_down():
+    raise ZeroDivisionError
+
+
+def surroundings(folder):
+    return lambda item, tick: (Path(folder) / item).write_text(os.environ["OMP_NUM_THREADS"])
+
+
+@pytest.mark.parametrize(("items", "processes", "used"), [(7, 3, 3), (2, 5, 2), (1, 4, 1)])
+def test_every_item_is_done_once_and_its_ticks_are_counted(tmp_path, items, processes, used):
+    ticks = []
+    work = [(f"item {i}", i + 1) for i in range(items)]
+    share_out(counting, str(tmp_path), work, processes=processes, advance=ticks.append)
+    assert len(list(tmp_path.glob("prepared *"))) == used
+    assert sorted(p.name for p in tmp_path.glob("item *")) == [name for name, _ in work]
+    assert sum(ticks) == items * (items + 1) // 2
+    assert min(ticks) > 0
+
+
+def test_many_ticks_are_all_counted(tmp_path):
+    ticks = []
+    share_out(counting, str(tmp_path), [("item", 9999)], processes=1, advance=ticks.append)
+    assert sum(ticks) == 9999
+
+
+def test_nothing_to_do_starts_nothing(tmp_path):
+    share_out(counting, str(tmp_path), [], processes=2, advance=lambda n: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def has_ended(folder):
+    """Whether the process of the endless item is gone; it is ended where it is not."""
+    pid = int((folder / "pid").read_text())
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, 9)
+    return False
+
+
+@pytest.mark.parametrize(
+    ("fail", "error", "says"),
+    [
+        (refuse, InputError, r"^clip ü\.mp4: is odd!; leave it out\.$"),
+        (die, RuntimeError, "a worker process ended with 7"),
+        (break_down, RuntimeError, "a worker process ended with 1"),
+    ],
+)
+@pytest.mark.parametrize("order", [("failing", "endless"), ("endless", "failing")])
+def test_a_failure_arrives_and_the_others_are_stopped(tmp_path, fail, error, says, order):
+    with pytest.raises(error, match=says):
+        share_out(partial(failing, fail), str(tmp_path), order, processes=2, advance=lambda n: None)
+    assert has_ended(tmp_path)
+
+
+def test_an_error_while_preparing_arrives(tmp_path):
+    missing = str(tmp_path / "none")
+    with pytest.raises(RuntimeError, match="ended with 1"):
+        share_out(counting, missing, [("item", 1)], processes=1, advance=lambda n: None)
+
+
+def test_an_interrupt_stops_all(tmp_path):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        share_out(ticking, str(tmp_path), ["a", "b"], processes=2, advance=interrupt)
+    for pid in tmp_path.glob("pid *"):
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid.name.split()[1]), 0)
+    assert list(tmp_path.glob("pid *"))
+
+
+def ticking(folder):
+    (Path(folder) / f"pid {os.getpid()}").touch()
+
+    def work(_, tick):
+        tick()
+        time.sleep(10 * WAIT_S)
+
+    return work
+
+
+def test_a_process_has_one_thread_for_each_library(tmp_path):
+    share_out(surroundings, str(tmp_path), ["a"], processes=1, advance=lambda n: None)
+    assert (tmp_path / "a").read_text() == "1"
