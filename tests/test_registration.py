@@ -200,6 +200,15 @@ def test_a_lost_head_is_told_and_found_again(still):
     assert all(np.isfinite(pose).all() for pose in kept)
 
 
+def test_a_jump_of_the_head_is_followed_at_once(still):
+    frame, mouth = still
+    truth = [about(mouth, shift=(-25 if t < 3 else 30, 0)) for t in range(6)]
+    found = register([seen_by(frame, p) for p in truth], head_from_frame(frame, mouth))
+    poses, correlation = zip(*found, strict=True)
+    assert misses(poses, truth, mouth).max() < 1.0
+    assert min(correlation) > 0.9
+
+
 def test_frames_are_asked_for_one_at_a_time(still):
     frame, mouth = still
     taken = []

@@ -192,8 +192,14 @@ def test_stabilised_crops_hold_still(world, reference, tracks):
     assert still.std(axis=0).mean() < 0.7 * moving.std(axis=0).mean()
 
 
-def test_colours_are_read_inside_the_picture(reference):
+def test_colours_are_read_inside_the_picture(world, reference):
     assert len(reference.colours) == len(reference.colour_points) > 100
     assert reference.colours.dtype == np.float32
     assert reference.colours.min() >= 0
     assert reference.colours.max() <= 1
+    frame = frame_at(world.clips[0], 0)
+    high = np.array([10.0, 20.0, 26.0])  # such a head leaves the picture
+    cut = make_reference(frame, head_from_frame(frame, high), reference.region)
+    assert 0 < len(cut.colour_points) < len(reference.colour_points)
+    assert (cut.colour_points >= 0).all()
+    assert (cut.colour_points <= (143, 159)).all()
