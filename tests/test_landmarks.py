@@ -68,7 +68,7 @@ def test_landmarks_follow_the_flow_of_each_frame(basis):
     for points, a in zip(moved, alpha, strict=True):
         for (x, y), point in zip(at, points, strict=True):
             step = sum(w * basis.flows[i, y, x] for w, i in zip(a, basis.moving, strict=True))
-            np.testing.assert_allclose(point, corner + [x, y] + step, atol=1e-4)
+            np.testing.assert_allclose(point, np.array([x, y]) + corner + step, atol=1e-4)
     assert np.abs(moved - (corner + at)).max() > 1
 
 
