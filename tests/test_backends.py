@@ -249,7 +249,11 @@ def test_a_backend_that_cannot_load_fails_the_tests(tmp_path):
     (tmp_path / "test_one.py").write_text("def test_one(backend):\n    assert backend\n")
     tests = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_one.py"]
     done = subprocess.run(
-        [*tests, "--backend", "opencl:9:9"], cwd=tmp_path, capture_output=True, check=False
+        [*tests, "--backend", "opencl:9:9"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        capture_output=True,
+        check=False,
     )
     assert done.returncode == 1
     assert b"there is no device 'opencl:9:9'" in done.stdout
