@@ -110,7 +110,7 @@ def test_float32_sums_are_good_enough():
     double = solve_simplex(gram, right)
     g = regular(gram)
     cost = [b @ g @ b / 2 - right @ b for b in (single, double)]
-    assert cost[0] - cost[1] < 1e-4 * abs(cost[1])
+    assert cost[0] - cost[1] < 1e-8 * abs(cost[1])
 
 
 def test_alpha_is_the_ridge_regression_of_the_flow(basis, analyzer):
