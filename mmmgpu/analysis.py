@@ -24,6 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from mmmgpu.backends import Backend
 from mmmgpu.basis import Basis, cut
+from mmmgpu.errors import InputError
 from mmmgpu.flows import Matcher, best_flow, matcher, pull
 from mmmgpu.synthesis import NO_TEXTURE, warp_prototypes
 
@@ -37,6 +38,7 @@ STEPS = 2  # Gauss-Newton steps
 OUTLIER = 0.2  # a pixel that differs by more than this counts less in a step
 WAYPOINTS = 1  # prototypes tried as waypoints of the flow to a frame
 NEAREST = 16  # prototypes that the first estimate of beta is made of
+STILL = 1e-6  # [px^2] mean square of a flow that is none
 MARGIN = 4  # [px] kept around the masks
 THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are looked for
 
@@ -69,7 +71,11 @@ class Analyzer:
 
 
 def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
-    """Compute what does not change from frame to frame; `flow` is one of `flows.MATCHERS`."""
+    """Compute what does not change from frame to frame; `flow` is one of `flows.MATCHERS`.
+
+    Raises:
+        InputError: The prototypes do not move against each other.
+    """
     basis, inside = _tight(basis)
     pixels = np.flatnonzero(basis.w_f > 0.02)
     weight = basis.w_f.ravel()[pixels]
@@ -77,6 +83,10 @@ def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
     x, y = moving[..., 0].T, moving[..., 1].T
     gram = (x.T * weight) @ x + (y.T * weight) @ y
     energy = float(np.trace(gram)) / len(gram)
+    if energy < STILL * float(weight.sum()):
+        raise InputError(
+            "the mouth never moves in the prototypes; give clips of speech, or --region X,Y,W,H"
+        )
     regular = gram.astype(np.float64) + FLOW_RIDGE * energy * np.eye(len(gram))
     texture = np.flatnonzero(basis.w_t > 0.01)
     return Analyzer(

@@ -59,15 +59,16 @@ def _place(
     h, w = cover.shape
     matrix = pose @ region.to_frame
     corners = project(matrix, np.array([[0.0, 0], [w - 1, 0], [w - 1, h - 1], [0, h - 1]]))
-    left, top = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, shape[1::-1])
-    right, bottom = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 1, 0, shape[1::-1])
-    box = (slice(top, max(bottom, top + 1)), slice(left, max(right, left + 1)))
-    size = (box[1].stop - left, box[0].stop - top)
+    size = np.array(shape[1::-1])
+    left, top = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, size - 1)
+    right, bottom = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 1, (left + 1, top + 1), size)
+    box = (slice(top, bottom), slice(left, right))
+    extent = (int(right - left), int(bottom - top))
     shifted = np.array([[1.0, 0, -left], [0, 1.0, -top], [0, 0, 1.0]]) @ matrix
     placed = cv2.warpPerspective(
-        image, shifted, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        image, shifted, extent, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )
-    opacity = cv2.warpPerspective(cover, shifted, size, flags=cv2.INTER_LINEAR)
+    opacity = cv2.warpPerspective(cover, shifted, extent, flags=cv2.INTER_LINEAR)
     return box, np.asarray(placed, np.float32), np.asarray(opacity, np.float32)
 
 

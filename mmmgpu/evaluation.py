@@ -86,6 +86,7 @@ def evaluate(
         InputError: A clip, an alignment or the landmarks cannot be used.
     """
     corpus = open_corpus([Path(c) for c in clips], Path(alignments), sync=sync)
+    points = None if landmarks is None else _lip_points(model, corpus, Path(landmarks))
     with one_thread_each():
         spoken = [_speak(model, clip, backend) for clip in corpus]
     result: dict[str, Any] = {"clips": [clip.path.name for clip in corpus]}
@@ -94,8 +95,8 @@ def evaluate(
         result["also_in_training"] = seen
     for stream in ("alpha", "beta"):
         result[stream] = _stream(spoken, stream)
-    if landmarks is not None:
-        result["lips"] = _lips(model, spoken, Path(landmarks))
+    if points is not None:
+        result["lips"] = _lips(model, spoken, *points)
     return result
 
 
@@ -167,15 +168,26 @@ def _interval(found: Interval) -> dict[str, Any]:
     return {"mean": found.mean, "half_width_95": half, "clips": found.n}
 
 
-def _lips(model: Model, spoken: Sequence[_Spoken], folder: Path) -> dict[str, Any]:
-    """Distances [px of the frame], opening [px of the reference] and jitter of the lips."""
+def _lip_points(model: Model, corpus: Sequence[Clip], folder: Path) -> tuple[Floats, list[Floats]]:
+    """Lips of the reference frame, (n, 2) [px], and of every frame of every clip, (T, n, 2)."""
     name, t = model.sources[model.basis.reference]
-    with np.load(folder / f"{Path(name).stem}.npz", allow_pickle=False) as arrays:
-        origin = np.asarray(arrays["points"], np.float64)[t, LIPS]
+    origin = read_landmarks(folder, Path(name))
+    if t >= len(origin):
+        raise InputError(
+            f"{folder}: the landmarks of {name} end before frame {t}, the model's reference; "
+            "give those of the clips that the model was trained on"
+        )
+    real = [read_landmarks(folder, clip.path, clip.info.frames)[:, LIPS] for clip in corpus]
+    return origin[t, LIPS], real
+
+
+def _lips(
+    model: Model, spoken: Sequence[_Spoken], origin: Floats, points: Sequence[Floats]
+) -> dict[str, Any]:
+    """Distances [px of the frame], opening [px of the reference] and jitter of the lips."""
     series: dict[str, list[Floats]] = {k: [] for k in ("real", "analysed", *KINDS)}
     distance: dict[str, list[float]] = {k: [] for k in ("analysed", *KINDS)}
-    for s in spoken:
-        real = read_landmarks(folder, s.clip.path, s.clip.info.frames)[:, LIPS]
+    for s, real in zip(spoken, points, strict=True):
         poses = s.analysed.track.poses
         series["real"].append(carried(np.asarray(np.linalg.inv(poses), np.float64), real))
         for kind, distances in distance.items():

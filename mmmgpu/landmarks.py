@@ -17,30 +17,41 @@ from mmmgpu.registration import project
 
 Floats = NDArray[np.float64]
 
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    zipfile.BadZipFile,
+)
 OUTER_LIP, LIPS = slice(0, 20), slice(0, 40)
 LOWER, UPPER = 5, 15  # middle of the outer lower and upper lip
 HULL_SCALE = 1.5  # of the outer lip's hull, about its centre: where pictures are compared
 
 
-def read_landmarks(folder: Path, clip: Path, frames: int) -> Floats:
-    """The landmarks of `clip`, (frames, n, 2) [px].
+def read_landmarks(folder: Path, clip: Path, frames: int | None = None) -> Floats:
+    """The landmarks of `clip`, (frames, n, 2) [px]; of any number of frames if None.
 
     Raises:
         InputError: There are none, or not for so many frames, or some are not finite.
     """
     path = folder / f"{clip.stem}.npz"
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            points = np.asarray(arrays["points"], np.float64)
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            points = np.asarray(arrays["points"])
+    except _UNREADABLE as e:
         raise InputError(f"{path}: no landmarks of {clip} ({e}); give --landmarks DIR") from e
-    if points.ndim != 3 or points.shape[0] != frames or points.shape[1] < 40:
+    wanted = (len(points) if frames is None and points.ndim else frames, 2)
+    if points.ndim != 3 or (len(points), points.shape[2]) != wanted or points.shape[1] < 40:
         raise InputError(
-            f"{path}: must hold points of shape ({frames}, 40 or more, 2), has {points.shape}"
+            f"{path}: must hold points of shape ({frames or 'frames'}, 40 or more, 2), "
+            f"has {points.shape}"
         )
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: holds NaN or infinity; leave the clip out")
-    return points
+    if points.dtype.kind not in "fiu" or not np.isfinite(points).all():
+        raise InputError(f"{path}: must hold finite numbers; leave the clip out")
+    return points.astype(np.float64)
 
 
 def moved_landmarks(basis: Basis, alpha: Floats, points: Floats) -> Floats:

@@ -18,6 +18,7 @@ from mmmgpu.analysis import (
 from mmmgpu.analysis import _fit_texture as fit_texture
 from mmmgpu.analysis import _refine as refine
 from mmmgpu.backends import get_backend
+from mmmgpu.errors import InputError
 from mmmgpu.synthesis import synthesize_one
 
 
@@ -235,3 +236,8 @@ def test_inputs_are_not_changed(basis, analyzer, kernels):
     np.testing.assert_array_equal(image, basis.images[3])
     again = prepare_analysis(replace(basis))
     np.testing.assert_array_equal(again.thumbnails, analyzer.thumbnails)
+
+
+def test_prototypes_that_do_not_move_are_an_error(basis):
+    with pytest.raises(InputError, match="never moves"):
+        prepare_analysis(replace(basis, flows=np.zeros_like(basis.flows)))

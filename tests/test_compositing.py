@@ -81,6 +81,14 @@ def test_a_region_half_out_of_the_frame_is_cut():
     assert (got != under).any()
 
 
+@pytest.mark.parametrize("move", [(-500, 0), (500, 0), (0, -500), (0, 500)])
+def test_a_region_out_of_the_frame_changes_nothing(move):
+    under, rng = frame(), np.random.default_rng(0)
+    given = (image(), COVER, shifted(*move), track(), REGION)
+    np.testing.assert_array_equal(composite(under, *given), under)
+    np.testing.assert_array_equal(composite_matched(under, *given, rng), under)
+
+
 @pytest.mark.parametrize("slope", [0.0, 0.1])
 def test_a_planar_difference_of_colour_is_undone(slope):
     under = frame()

@@ -126,8 +126,10 @@ NAN = np.full((4, 40, 2), np.nan)
         ({"points": np.zeros((3, 103, 2))}, r"\(4, 40 or more, 2\), has \(3, 103, 2\)"),
         ({"points": np.zeros((4, 39, 2))}, r"has \(4, 39, 2\)"),
         ({"points": np.zeros((4, 206))}, r"has \(4, 206\)"),
-        ({"points": np.array(["a"])}, "no landmarks"),
-        ({"points": NAN}, "NaN or infinity"),
+        ({"points": np.array(["a"])}, r"has \(1,\)"),
+        ({"points": np.full((4, 40, 2), "a")}, "finite numbers"),
+        ({"points": np.zeros((4, 40, 3))}, r"has \(4, 40, 3\)"),
+        ({"points": NAN}, "finite numbers"),
         ({"points": np.array([None])}, "no landmarks"),
     ],
 )
