@@ -140,8 +140,11 @@ def test_train_skips_a_clip_without_the_head(mmmgpu, world, tmp_path):
     box = ",".join(str(n) for n in load(trained_model(world)).reference.region.box)
     out = tmp_path / "new" / "p.mmm"
     args = (folder, nobody, "--alignments", tmp_path, "--prototypes", 5, "--region", box)
-    ended = mmmgpu("train", *args, "--out", out, "--json", tmp_path / "results.json", "--seed", 3)
+    report = tmp_path / "report.html"
+    outputs = ("--out", out, "--json", tmp_path / "results.json", "--report", report)
+    ended = mmmgpu("train", *args, *outputs, "--seed", 3)
     assert ended.status == 0
+    assert "nobody.mkv" in report.read_text()
     assert ended.err.count("warning: skipped: ") == 1
     assert "nobody.mkv" in ended.err
     assert list(out.parent.iterdir()) == [out]
@@ -185,9 +188,11 @@ def test_reconstruct_measures_against_landmarks(mmmgpu, world, model, tmp_path):
 
 def test_evaluate(mmmgpu, world, model, tmp_path):
     clips, results = world.clips[2:], tmp_path / "results.json"
-    args = ("--alignments", world.alignments, "--json", results)
+    report = tmp_path / "report.html"
+    args = ("--alignments", world.alignments, "--json", results, "--report", report)
     ended = mmmgpu("evaluate", model, *clips, *args)
     assert ended.status == 0
+    assert "95 %" in report.read_text()
     facts = json.loads(results.read_text())
     assert facts["clips"] == [clip.name for clip in clips]
     assert facts["alpha"]["all"]["rms"]["trained"]["mean"] > 0

@@ -7,6 +7,7 @@ from mmmgpu.commands.options import (
     Json,
     Landmarks,
     ModelFile,
+    Report,
     Sync,
 )
 from mmmgpu.commands.places import require_output, videos_in, write_results
@@ -23,6 +24,7 @@ def evaluate(
     landmarks: Landmarks = None,
     sync: Sync,
     backend: Backend,
+    report: Report = None,
     json: Json = None,
 ) -> None:
     """Compare synthesis from phones with real CLIPs.
@@ -33,12 +35,16 @@ def evaluate(
     """
     found = videos_in(clips)
     require_output(json, [model, *found])
+    require_output(report, [model, *found])
     from mmmgpu.backends import get_backend
     from mmmgpu.evaluation import evaluate as judge
     from mmmgpu.model_files import load
+    from mmmgpu.reports import write_report
 
     get_backend(backend)
     person = load(model)
     results = judge(person, found, alignments, sync=sync, landmarks=landmarks, backend=backend)
     show_table(f"{model} on {len(found)} clips", flat(results))
     write_results(results, json)
+    if report is not None:
+        write_report(person, report, evaluation=results, backend=backend)

@@ -65,6 +65,10 @@ VideoOut = Annotated[
 Lossless = Annotated[
     bool, typer.Option("--lossless", help="Exact RGB in place of H.264; best in .mkv.")
 ]
+Report = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE", help="Also write a report with pictures, as HTML."),
+]
 Json = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the results as JSON.")
 ]

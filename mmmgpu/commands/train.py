@@ -11,6 +11,7 @@ from mmmgpu.commands.options import (
     Clips,
     Json,
     LibraryDefault,
+    Report,
     Sync,
     parse_box,
 )
@@ -60,6 +61,7 @@ def train(
         ),
     ],
     backend: Backend,
+    report: Report = None,
     json: Json = None,
 ) -> None:
     """Learn a person from CLIPs and write a model.
@@ -71,6 +73,7 @@ def train(
     from mmmgpu.backends import get_backend
     from mmmgpu.commands.summaries import model_facts, show_model
     from mmmgpu.flows import MATCHERS
+    from mmmgpu.reports import write_report
     from mmmgpu.training import Options
     from mmmgpu.training import train as learn
 
@@ -88,6 +91,9 @@ def train(
     found = videos_in(clips)
     require_output(out, found)
     require_output(json, found)
+    require_output(report, [*found, out])
     model = learn(found, alignments, out, options=options, backend=backend)
     show_model(model, out)
     write_results(model_facts(model, out), json)
+    if report is not None:
+        write_report(model, report, backend=backend)
