@@ -12,6 +12,12 @@ from mmmgpu.processes import share_out
 WAIT_S = 60  # at most, for another process
 
 
+@pytest.fixture(autouse=True)
+def _children_find_this_file(monkeypatch):
+    """What is shared out must be importable; pytest names this module from the project's root."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1])
+
+
 def counting(folder):
     """Leave one file an item, with as many ticks as it says."""
     prepared = Path(folder) / f"prepared {os.getpid()}"
