@@ -7,7 +7,8 @@ options, told by a fingerprint; steps of others are thrown away.
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.errors import InputError
-from mmmgpu.files import atomic_path, require_folder, write_text
+from mmmgpu.files import TEMPORARY, atomic_path, require_folder, write_text
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -38,13 +39,28 @@ def open_checkpoints(folder: Path, mark: str) -> Path:
         if name.read_text() != mark:
             shutil.rmtree(folder)
             require_folder(folder)
-    elif any(not file.name.startswith(".mmmgpu-") for file in folder.iterdir()):
+    elif any(not file.name.startswith(TEMPORARY) for file in folder.iterdir()):
         raise InputError(
             f"{folder}: is needed for steps of the work but holds files not made by mmmgpu; "
             "move it or choose another name for the result"
         )
+    _remove_unfinished(folder)
     write_text(name, mark)
     return folder
+
+
+@contextmanager
+def finished_steps_only(folder: Path) -> Iterator[None]:
+    """Removes from `folder` at the end what killed processes were still writing."""
+    try:
+        yield
+    finally:
+        _remove_unfinished(folder)
+
+
+def _remove_unfinished(folder: Path) -> None:
+    for file in folder.glob(f"{TEMPORARY}*"):
+        file.unlink()
 
 
 def read_step(folder: Path, name: str) -> dict[str, NDArray[Any]] | None:

@@ -15,6 +15,8 @@ from typing import Any
 
 from .errors import InputError
 
+TEMPORARY = ".mmmgpu-"  # how the name of a file begins that is still being written
+
 _REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space or choose another folder",
     errno.EDQUOT: "the disk quota is used up: free some space or choose another folder",
@@ -71,7 +73,7 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _temporary(target: Path) -> Path:
-    return target.absolute().with_name(f".mmmgpu-{secrets.token_hex(6)}{target.suffix}")
+    return target.absolute().with_name(f"{TEMPORARY}{secrets.token_hex(6)}{target.suffix}")
 
 
 def _create(temporary: Path, target: Path) -> None:

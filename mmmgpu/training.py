@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from mmmgpu.analysis import analyze, prepare_analysis, thumbnail
 from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.basis import Basis, make_basis
-from mmmgpu.checkpoints import fingerprint, open_checkpoints, read_step, write_step
+from mmmgpu.checkpoints import (
+    fingerprint,
+    finished_steps_only,
+    open_checkpoints,
+    read_step,
+    write_step,
+)
 from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.errors import InputError
 from mmmgpu.flows import best_flow, extend_flows, matcher, path_to, shortest_paths
@@ -191,7 +197,8 @@ class _Training:
         with progress_bar(sum(clip.info.frames for clip in clips), label) as advance:
             advance(sum(c.info.frames for c, d in zip(clips, done, strict=True) if d))
             left = [item for item, d in zip(items, done, strict=True) if not d]
-            share_out(prepare, shared, left, processes=default_threads(), advance=advance)
+            with finished_steps_only(self.folder):
+                share_out(prepare, shared, left, processes=default_threads(), advance=advance)
 
     def _choose(self, frames: "_Frames") -> tuple[NDArray[np.int64], int, F32]:
         """Prototype frames, the reference among them, and the PCA coordinates of all frames."""

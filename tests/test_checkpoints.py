@@ -1,9 +1,17 @@
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from mmmgpu.checkpoints import fingerprint, open_checkpoints, read_step, write_step
+from mmmgpu.checkpoints import (
+    fingerprint,
+    finished_steps_only,
+    open_checkpoints,
+    read_step,
+    write_step,
+)
 from mmmgpu.errors import InputError
 
 
@@ -108,6 +116,29 @@ def test_no_step_is_written_by_halves(tmp_path):
     with pytest.raises(ZeroDivisionError):
         write_step(folder, "step", {"good": np.arange(3), "bad": Unwritable()})
     assert [p.name for p in folder.iterdir()] == ["fingerprint"]
+
+
+def written_when_killed(folder):
+    """A process is killed while it writes a step."""
+    writing = (
+        "import os, sys; from pathlib import Path; from mmmgpu.files import atomic_path\n"
+        "with atomic_path(Path(sys.argv[1]) / 'b.npz') as path:\n"
+        "    path.write_bytes(b'half'); os.kill(os.getpid(), 9)"
+    )
+    killed = subprocess.run([sys.executable, "-c", writing, str(folder)], check=False)
+    assert killed.returncode == -9
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_what_a_killed_process_was_writing_is_removed(tmp_path):
+    folder = open_checkpoints(tmp_path / "work", "mark")
+    write_step(folder, "a", {"x": np.arange(3)})
+    with finished_steps_only(folder):
+        written_when_killed(folder)
+    assert {p.name for p in folder.iterdir()} == {"fingerprint", "a.npz"}
+    written_when_killed(folder)
+    open_checkpoints(folder, "mark")
+    assert {p.name for p in folder.iterdir()} == {"fingerprint", "a.npz"}
 
 
 def test_no_pickle_is_read(tmp_path):

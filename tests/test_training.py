@@ -14,6 +14,7 @@ from mmmgpu import load
 from mmmgpu.analysis import analyze, prepare_analysis
 from mmmgpu.backends import get_backend
 from mmmgpu.errors import InputError
+from mmmgpu.files import TEMPORARY
 from mmmgpu.models import project_on_simplex, trajectories
 from mmmgpu.synthesis import synthesize_one
 from mmmgpu.tracks import crops, track_clip
@@ -137,6 +138,20 @@ def test_a_killed_training_continues_to_the_same_bytes(world, trained, tmp_path,
     assert asked[1] < 4  # nor all analysed
     assert out.read_bytes() == trained[0].read_bytes()
     assert [p.name for p in tmp_path.iterdir()] == [out.name]
+
+
+def test_an_interrupt_leaves_no_half_written_step(world, tmp_path, monkeypatch):
+    """The moment is chosen here: a process that tracks is killed over a file it writes."""
+    work = tmp_path / "m.mmm.work"
+
+    def killed(*_, **__):
+        (work / f"{TEMPORARY}0.npz").write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mmmgpu.training, "share_out", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(world.clips, world.alignments, tmp_path / "m.mmm", options=OPTIONS)
+    assert [path.name for path in work.iterdir()] == ["fingerprint"]
 
 
 def copies(world, folder, count):
