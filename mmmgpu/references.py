@@ -62,7 +62,7 @@ def find_reference(
         return make_reference(frame, head_from_frame(frame, np.array(region.mouth)), region)
     sample = [corpus[i] for i in _spread(len(corpus), SEARCH_CLIPS)]
     references = []
-    for clip in [middle, *sample]:
+    for clip in [middle, *(other for other in sample if other is not middle)]:
         reference, seen = _reference_from(clip, sample, sync)
         if 2 * len(seen) > len(sample):
             # clips that do not show this head have misled the search

@@ -58,6 +58,25 @@ def test_a_bad_region_is_an_error(corpus):
         find_reference(corpus, (100, 80, 60, 60))
 
 
+def test_a_middle_clip_without_the_head_is_passed_over(world, tmp_path):
+    """The next clip gives the reference, and the mouth is found on it from the others alone."""
+    clips = list(world.clips)
+    noise = np.random.default_rng(0).integers(0, 255, (40, 160, 144, 3), dtype=np.uint8)
+    clips[2] = tmp_path / world.clips[2].name
+    sound, rate = read_sound(world.clips[2])
+    sound = (sound[: round(40 / 25 * rate)], rate)
+    write_video(clips[2], noise, fps=25, sound=sound, lossless=True)
+    corpus = open_corpus(world.clips, world.alignments)
+    corpus[2] = replace(corpus[2], path=clips[2], info=probe(clips[2]))
+    reference = find_reference(corpus, None)
+    again = make_reference(frame_at(world.clips[0], 0), reference.head, reference.region)
+    np.testing.assert_array_equal(reference.colours, again.colours)
+    x, y, width = true_mouth(world, clip=0)
+    got = reference.region.mouth
+    assert np.hypot(got[0] - x, got[1] - y) < 0.3 * width
+    assert 0.6 * width < got[2] < 1.4 * width
+
+
 def late_sound(world, folder, seconds):
     """The clips with their sound moved later by `seconds`."""
     clips = []
