@@ -64,17 +64,14 @@ def find_reference(
     references = []
     for clip in [middle, *(other for other in sample if other is not middle)]:
         reference, seen = _reference_from(clip, sample, sync)
-        if 2 * len(seen) > len(sample):
-            # clips that do not show this head have misled the search
-            return reference if seen == sample else _reference_from(clip, seen, sync)[0]
+        if 2 * seen > len(sample):
+            return reference
         references.append(reference)
     return references[0]
 
 
-def _reference_from(
-    clip: Clip, sample: Sequence[Clip], sync: float
-) -> tuple[Reference, list[Clip]]:
-    """A reference from `clip` and the clips of `sample` in which its head is found."""
+def _reference_from(clip: Clip, sample: Sequence[Clip], sync: float) -> tuple[Reference, int]:
+    """A reference from `clip`, and in how many clips of `sample` its head is found."""
     frame = frame_at(clip.path, 0)
     x, y, width = _find_mouth(sample, sync)
     seen_wide = width_from_eyes(to_gray(frame), (x, y - CHIN_PULL * width, width))
@@ -84,7 +81,7 @@ def _reference_from(
     x, y = _second_look(seen or sample, head, np.array(mouth), sync)
     region = region_around((x, y, mouth[2]), (clip.info.width, clip.info.height))
     head = head_from_frame(frame, np.array(region.mouth))
-    return make_reference(frame, head, region), seen
+    return make_reference(frame, head, region), len(seen)
 
 
 def _shows(clip: Clip, head: Head) -> bool:
