@@ -10,7 +10,7 @@ from mmmgpu.alignments import Alignment, Segment
 from mmmgpu.errors import InputError
 from mmmgpu.models import project_on_simplex, trajectories
 from mmmgpu.sounds import read_sound
-from mmmgpu.speaking import FAINT, at_rate, plan, render, silent_mouth, speak
+from mmmgpu.speaking import FAINT, FOCUS, at_rate, plan, render, silent_mouth, speak
 from mmmgpu.trajectory_files import Trajectory
 from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import Speech
@@ -59,7 +59,7 @@ def test_a_plan_is_as_long_as_what_is_said(basis, fps, duration, frames):
 
 
 @pytest.mark.parametrize("articulation", [0.5, 1.0, 1.5])
-def test_beta_keeps_to_the_simplex_without_faint_textures(basis, articulation):
+def test_beta_keeps_to_the_simplex_and_to_its_strongest_textures(basis, articulation):
     model = replace(make_model(basis), fps=Fraction(25))
     planned = plan(model, ALIGNMENT, articulation=articulation)
     assert planned.labels == ("SIL",) * 3 + ("AA",) * 3 + ("M",) * 2
@@ -71,9 +71,21 @@ def test_beta_keeps_to_the_simplex_without_faint_textures(basis, articulation):
         planned.alpha, silent[0] + articulation * (alpha - silent[0]), atol=1e-12
     )
     near = project_on_simplex(silent[1] + articulation * (beta - silent[1]))
-    np.testing.assert_array_equal(planned.beta == 0, near <= FAINT)
-    kept = [[max(b - FAINT, 0) for b in row] for row in near]
+    kept = [[max((b / max(row)) ** FOCUS - FAINT, 0) for b in row] for row in near]
+    assert 0 < np.mean(planned.beta == 0) < 1
+    assert (planned.beta.max(axis=1) >= near.max(axis=1)).all()
     np.testing.assert_allclose(planned.beta, [np.array(r) / sum(r) for r in kept], atol=1e-12)
+
+
+def test_many_equal_textures_are_all_kept(basis):
+    """A model may have more prototypes than one over the share that goes."""
+    many = replace(
+        basis, images=np.repeat(basis.images, 12, axis=0), flows=np.repeat(basis.flows, 12, axis=0)
+    )
+    model = make_model(many)
+    equal = replace(model.beta.trained, mean=np.full_like(model.beta.trained.mean, 1 / 60))
+    model = replace(model, beta=replace(model.beta, trained=equal))
+    np.testing.assert_allclose(plan(model, ALIGNMENT).beta, 1 / 60, atol=1e-9)
 
 
 def test_articulation_1_is_the_default(basis):
