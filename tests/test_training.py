@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from worlds import FPS, RATE, texture
 
-import mmmgpu.training
+import mmmgpu.corpus_steps
 from mmmgpu import load
 from mmmgpu.analysis import analyze, prepare_analysis
 from mmmgpu.backends import get_backend
@@ -126,13 +126,13 @@ def test_a_killed_training_continues_to_the_same_bytes(world, trained, tmp_path,
     assert any(name.startswith("analysis-") for name in done)
 
     asked = []
-    share_out = mmmgpu.training.share_out
+    share_out = mmmgpu.corpus_steps.share_out
 
     def watched(prepare, shared, items, **options):
         asked.append(len(items))
         share_out(prepare, shared, items, **options)
 
-    monkeypatch.setattr(mmmgpu.training, "share_out", watched)
+    monkeypatch.setattr(mmmgpu.corpus_steps, "share_out", watched)
     train(world.clips, world.alignments, out, options=OPTIONS)
     assert asked[0] == 0  # nothing is tracked again
     assert asked[1] < 4  # nor all analysed
@@ -148,7 +148,7 @@ def test_an_interrupt_leaves_no_half_written_step(world, tmp_path, monkeypatch):
         (work / f"{TEMPORARY}0.npz").write_bytes(b"half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(mmmgpu.training, "share_out", killed)
+    monkeypatch.setattr(mmmgpu.corpus_steps, "share_out", killed)
     with pytest.raises(KeyboardInterrupt):
         train(world.clips, world.alignments, tmp_path / "m.mmm", options=OPTIONS)
     assert [path.name for path in work.iterdir()] == ["fingerprint"]

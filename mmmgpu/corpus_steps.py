@@ -1,0 +1,180 @@
+"""What training and transfer do with every clip of a corpus: track it, cut it, analyse it.
+
+What is found for a clip is kept in a folder of finished steps (`mmmgpu.checkpoints`); worker
+processes do the clips.
+"""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.analysis import analyze, prepare_analysis, thumbnail
+from mmmgpu.backends import default_threads, get_backend
+from mmmgpu.basis import Basis
+from mmmgpu.checkpoints import finished_steps_only, read_step, write_step
+from mmmgpu.corpora import Clip
+from mmmgpu.errors import InputError
+from mmmgpu.processes import Tick, Work, share_out
+from mmmgpu.progress import progress_bar
+from mmmgpu.regions import Region, mouth_mask
+from mmmgpu.tracks import Reference, Track, crop, crops, track_clip
+from mmmgpu.videos import read_frames
+
+Floats = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+
+def for_all(
+    folder: Path,
+    prepare: Callable[[Any], Work],
+    shared: Any,
+    step: str,
+    label: str,
+    items: Sequence[Any],
+) -> None:
+    """Do what ``prepare(shared)`` returns to every item whose step is not yet in `folder`.
+
+    An item is a clip, or a tuple that begins with one. `label` names the progress bar.
+    """
+    clips = [item[0] if isinstance(item, tuple) else item for item in items]
+    done = [read_step(folder, f"{step}-{clip.path.name}") is not None for clip in clips]
+    with progress_bar(sum(clip.info.frames for clip in clips), label) as advance:
+        advance(sum(c.info.frames for c, d in zip(clips, done, strict=True) if d))
+        left = [item for item, d in zip(items, done, strict=True) if not d]
+        with finished_steps_only(folder):
+            share_out(prepare, shared, left, processes=default_threads(), advance=advance)
+
+
+def finished_step(folder: Path, step: str, name: str) -> dict[str, NDArray[Any]]:
+    """A step that has been done for the clip called `name`."""
+    arrays = read_step(folder, f"{step}-{name}")
+    assert arrays is not None, (step, name)
+    return arrays
+
+
+def track_corpus(
+    folder: Path, corpus: Sequence[Clip], reference: Reference
+) -> tuple[dict[str, Track], dict[str, str]]:
+    """Tracks by clip name, and why other clips were skipped; thumbnails are left in `folder`.
+
+    Raises:
+        InputError: The head is found in no clip.
+    """
+    shared = (folder, reference, mouth_mask(reference.region))
+    for_all(folder, _tracking, shared, "track", "track frames", corpus)
+    tracks, skipped = {}, {}
+    for clip in corpus:
+        name = clip.path.name
+        arrays = finished_step(folder, "track", name)
+        if "skipped" in arrays:
+            skipped[name] = str(arrays["skipped"])
+            print(f"warning: skipped: {skipped[name]}", file=sys.stderr)
+        else:
+            fields = {f: arrays[f] for f in arrays if f not in ("thumbnails", "residual")}
+            tracks[name] = Track(**fields, residual=float(arrays["residual"]))
+    if not tracks:
+        raise InputError(next(iter(skipped.values())))
+    return tracks, skipped
+
+
+def _tracking(shared: tuple[Path, Reference, F32]) -> Work:
+    """Keeps the track of a clip and a thumbnail of every frame; or why it must be left out."""
+    folder, reference, mask = shared
+
+    def work(clip: Clip, tick: Tick) -> None:
+        try:
+            track = track_clip(clip.path, reference)
+        except InputError as e:
+            write_step(folder, f"track-{clip.path.name}", {"skipped": np.array(str(e))})
+            return
+        small = []
+        for image in crops(clip.path, track, reference.region):
+            small.append(np.round(thumbnail(image, mask) * 255).astype(np.uint8))
+            tick()
+        arrays = vars(track) | {"residual": np.array(track.residual)}
+        write_step(folder, f"track-{clip.path.name}", {**arrays, "thumbnails": np.array(small)})
+
+    return work
+
+
+def analyse_corpus(
+    folder: Path, frames: "Frames", basis: Basis, *, flow: str, backend: str
+) -> tuple[list[Floats], list[Floats]]:
+    """alpha (T, M - 1) and beta (T, M) of every clip of `frames`."""
+    shared = (folder, basis, flow, backend)
+    items = [(clip, frames.tracks[clip.path.name]) for clip in frames.clips]
+    for_all(folder, _analysing, shared, "analysis", "analyse frames", items)
+    done = [finished_step(folder, "analysis", clip.path.name) for clip in frames.clips]
+    return [d["alpha"] for d in done], [d["beta"] for d in done]
+
+
+def _analysing(shared: tuple[Path, Basis, str, str]) -> Work:
+    """Keeps alpha and beta of every frame of a clip."""
+    folder, basis, flow, backend = shared
+    analyzer, kernels = prepare_analysis(basis, flow=flow), get_backend(backend, 1)
+
+    def work(item: tuple[Clip, Track], tick: Tick) -> None:
+        clip, track = item
+        alpha, beta = [], []
+        for image in crops(clip.path, track, basis.region):
+            a, b = analyze(analyzer, image, kernels)
+            alpha.append(a)
+            beta.append(b)
+            tick()
+        arrays = {"alpha": np.array(alpha, np.float32), "beta": np.array(beta, np.float32)}
+        write_step(folder, f"analysis-{clip.path.name}", arrays)
+
+    return work
+
+
+@dataclass(frozen=True)
+class Thumbnails(Sequence[NDArray[np.uint8]]):
+    """The thumbnails of all clips, read from the work folder one clip at a time."""
+
+    folder: Path
+    clips: Sequence[Clip]
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, i: Any) -> Any:
+        return finished_step(self.folder, "track", self.clips[i].path.name)["thumbnails"]
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frames of all used clips as one numbered row."""
+
+    clips: Sequence[Clip]
+    tracks: Mapping[str, Track]
+
+    @property
+    def registered(self) -> NDArray[np.bool_]:
+        return np.concatenate([self.tracks[c.path.name].registered for c in self.clips])
+
+    def find(self, i: int) -> tuple[Clip, int]:
+        """The clip and its frame that are number `i` of the row."""
+        for clip in self.clips:
+            if i < clip.info.frames:
+                return clip, i
+            i -= clip.info.frames
+        raise IndexError(i)
+
+    def crops(self, numbers: Sequence[int], region: Region) -> dict[int, F32]:
+        """The regions of some frames, each clip read once; `numbers` is sorted."""
+        found, first = {}, 0
+        for clip in self.clips:
+            wanted = {i - first for i in numbers if first <= i < first + clip.info.frames}
+            if wanted:
+                track = self.tracks[clip.path.name]
+                frames = read_frames(clip.path, stop=max(wanted) + 1)
+                for t, frame in enumerate(frames):
+                    if t in wanted:
+                        found[first + t] = crop(frame, track.poses[t], track, region)
+            first += clip.info.frames
+        return found
