@@ -56,7 +56,16 @@ def scan(rng, queries=50, corpus=450, points=16384):
     return Case(name, "distance_scan", (*arrays, weights), peer="distance_scan")
 
 
-CASES: list[Callable[[np.random.Generator], Case]] = [splat, fill, blend, sample, scan]
+def rbf(rng, height=256, width=256, number=38):
+    y, x = np.mgrid[:height, :width]
+    centres = rng.uniform(0, [width, height], (number, 2))
+    affine = np.array([[20, 1.2, 0.1], [-10, -0.1, 1.3]])
+    arrays = np.stack([x, y], -1).reshape(-1, 2), centres, rng.normal(0, 5, (number, 2)), affine
+    name = "evaluate_rbf 256x256, 38 points"
+    return Case(name, "evaluate_rbf", tuple(a.astype(np.float32) for a in arrays), (0.003,))
+
+
+CASES: list[Callable[[np.random.Generator], Case]] = [splat, fill, blend, sample, scan, rbf]
 
 
 @dataclass(frozen=True)

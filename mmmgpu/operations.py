@@ -160,5 +160,47 @@ def distance_scan(
     return k.to_host(k.distance_scan(*_on_device(k, q, c, w)))
 
 
+def evaluate_rbf(
+    points: ArrayLike,
+    centres: ArrayLike,
+    weights: ArrayLike,
+    affine: ArrayLike,
+    sharpness: float,
+    *,
+    backend: str = "warp",
+) -> F32:
+    """A smooth map of the plane made of Gaussians and an affine part (CE05, Eq. 6).
+
+        S(p) = affine [1, x, y]' + sum_k weights_k exp(-sharpness |p - centres_k|^2)
+
+    `mmmgpu.correspondence` finds the weights; its own evaluation is float64. Here a Gaussian is
+    right to about 2e-7: the result is off by that share of the sum of |weights|.
+
+    Args:
+        points: (x, y) [px], shape (..., 2).
+        centres: Centres of the Gaussians [px], shape (N, 2).
+        weights: What each adds at its centre [px], shape (N, 2).
+        affine: Columns for 1 [px], x and y [1], shape (2, 3).
+        sharpness: 1 / (2 standard deviation^2) of the Gaussians [1/px^2], at least 0.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The points' images [px], shape (..., 2).
+    """
+    p = as_float32("points", points, "...", 2)
+    c = as_float32("centres", centres, "N", 2)
+    w = as_float32("weights", weights, len(c), 2)
+    a = as_float32("affine", affine, 2, 3)
+    if not 0 <= sharpness <= float(np.finfo(np.float32).max):
+        raise InputError(f"sharpness must be a finite number, at least 0, got {sharpness}")
+    if not p.size:
+        return np.zeros(p.shape, np.float32)
+    if not len(c):
+        c = w = np.zeros((1, 2), np.float32)
+    k = get_backend(backend)
+    at, places, shares, plane = _on_device(k, p.reshape(-1, 2), c, w, a)
+    return k.to_host(k.evaluate_rbf(at, places, shares, plane, sharpness)).reshape(p.shape)
+
+
 def _on_device(backend: Backend, *arrays: F32) -> list[Any]:
     return [backend.to_device(a) for a in arrays]

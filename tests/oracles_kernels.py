@@ -80,6 +80,17 @@ def sample(field, points):
     return np.array(samples)
 
 
+def evaluate_rbf(points, centres, weights, affine, sharpness):
+    """Images (P, 2) of points (P, 2): term by term."""
+    mapped = []
+    for x, y in points.astype(float):
+        value = affine.astype(float) @ [1, x, y]
+        for centre, weight in zip(centres.astype(float), weights.astype(float), strict=True):
+            value = value + weight * math.exp(-sharpness * math.dist((x, y), centre) ** 2)
+        mapped.append(value)
+    return np.array(mapped)
+
+
 def distance_scan(queries, corpus, weights):
     """Every pair of fields, point by point."""
     return np.array(

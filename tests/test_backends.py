@@ -29,7 +29,9 @@ blended = o.blend(filled, rng.random((3, 5)), backend=backend)
 sampled = o.sample(filled, flow * 9, backend=backend)
 rows = field.reshape(5, -1, 6)
 scanned = o.distance_scan(rows, np.tile(rows, (9, 1, 1)), rng.random(1320), backend=backend)
-results = warped, weight, alone, filled, blended, sampled, scanned
+plane = [[1, 2, 3], [4, 5, 6]]
+mapped = o.evaluate_rbf(flow * 9, rows[0, :7, :2], rows[1, :7, :2], plane, 0.3, backend=backend)
+results = warped, weight, alone, filled, blended, sampled, scanned, mapped
 print(hashlib.sha256(b"".join(r.tobytes() for r in results)).hexdigest())
 """
 
@@ -139,12 +141,14 @@ def test_every_output_is_written_and_no_scratch_is_read_before(backend, monkeypa
     weights, rows, shares = on_device(
         k, rng.random((2, 9)), rng.normal(0, 1, (9, 42, 5)), rng.random(42)
     )
+    centres, plane = on_device(k, rng.normal(0, 1, (19, 2)), rng.normal(0, 1, (2, 3)))
 
     def everything():
         warped, weight = k.forward_warp(field, flow)
         filled = k.fill_holes(warped, weight, 0.4)
         rest = k.blend(filled, weights), k.distance_scan(rows, rows, shares)
-        return [k.to_host(a).copy() for a in (warped, weight, filled, *rest)]
+        mapped = k.evaluate_rbf(centres, centres, centres, plane, 0.1)
+        return [k.to_host(a).copy() for a in (warped, weight, filled, *rest, mapped)]
 
     clean = everything()
     empty = type(k).empty

@@ -19,12 +19,20 @@ CALLS = {
     "blend": {"images": ONES, "weights": ONES[..., 0, 0, :2]},
     "sample": {"field": ONES, "points": POINTS},
     "distance_scan": {"queries": ONES[0], "corpus": ONES[1], "weights": ONES[0, 0, :, 0]},
+    "evaluate_rbf": {
+        "points": POINTS,
+        "centres": POINTS[0],
+        "weights": POINTS[1],
+        "affine": ONES[0, :2, 0],
+    },
 }
+SCALARS = {"evaluate_rbf": {"sharpness": 0.1}}
 ARGUMENTS = [(name, argument) for name, call in CALLS.items() for argument in call]
 
 
 def call(name, backend="numpy", **changed):
-    return getattr(operations, name)(**{**CALLS[name], **changed}, backend=backend)
+    given = {**CALLS[name], **SCALARS.get(name, {}), **changed}
+    return getattr(operations, name)(**given, backend=backend)
 
 
 def first(result):
@@ -83,6 +91,8 @@ def test_the_batch_axes_may_have_any_shape(backend, lead):
     filled = operations.fill_holes(field, weight + 1, backend=backend)
     sampled = operations.sample(field, flow, backend=backend)
     blended = operations.blend(np.ones((6, 4, 5, 3)), weights, backend=backend)
+    mapped = call("evaluate_rbf", backend, points=flow)
+    assert mapped.shape == flow.shape
     assert warped.shape == filled.shape == sampled.shape == blended.shape == field.shape
     assert weight.shape == field.shape[:-1]
     for index in np.ndindex(lead):
@@ -92,6 +102,7 @@ def test_the_batch_axes_may_have_any_shape(backend, lead):
         assert_array_equal(
             sampled[index], operations.sample(field[index], flow[index], backend=backend)
         )
+        assert_array_equal(mapped[index], call("evaluate_rbf", backend, points=flow[index]))
 
 
 def test_batch_axes_broadcast(backend):
@@ -145,6 +156,24 @@ def test_a_weight_at_the_threshold_is_valid(backend):
 def test_a_threshold_that_is_not_finite_is_an_error():
     with pytest.raises(InputError, match="threshold must be a finite number, got nan"):
         call("fill_holes", threshold=np.nan)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -0.1, 1e39])
+def test_a_sharpness_that_makes_no_gaussians_is_an_error(bad):
+    with pytest.raises(InputError, match="sharpness must be a finite number, at least 0, got"):
+        call("evaluate_rbf", sharpness=bad)
+
+
+@pytest.mark.parametrize("argument", ["centres", "weights"])
+def test_every_centre_needs_a_weight(argument):
+    with pytest.raises(InputError, match=r"weights must have shape \(\d, 2\), got \(\d, 2\)"):
+        call("evaluate_rbf", **{argument: POINTS[0, :6]})
+
+
+def test_without_centres_the_map_is_affine(backend):
+    none = np.zeros((0, 2))
+    mapped = call("evaluate_rbf", backend, points=[[2, 3]], centres=none, weights=none)
+    assert_array_equal(mapped, [[6, 6]])
 
 
 def test_points_must_have_the_batch_axes_of_the_field():

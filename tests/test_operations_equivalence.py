@@ -95,6 +95,14 @@ def test_the_reference_blends_samples_and_scans_as_the_loops_do():
     )
 
 
+@pytest.mark.parametrize("sharpness", [0, 0.03, 5])
+def test_the_reference_evaluates_gaussians_as_the_loops_do(sharpness):
+    rng = np.random.default_rng(0)
+    given = [rng.normal(0, 3, s).astype(np.float32) for s in ((9, 2), (4, 2), (4, 2), (2, 3))]
+    actual = operations.evaluate_rbf(*given, sharpness, backend="numpy")
+    assert_close(actual, oracles.evaluate_rbf(*given, sharpness))
+
+
 @pytest.mark.parametrize("channels", range(1, 9))
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("flow", FLOWS)
@@ -182,3 +190,30 @@ def test_distance_scan_of_large_equal_residuals(backend):
     weights = np.full(720 * 576, 0.7)
     actual = operations.distance_scan(queries, corpus, weights, backend=backend)
     assert_close(actual, operations.distance_scan(queries, corpus, weights, backend="numpy"))
+
+
+@pytest.mark.parametrize("number", [1, 3, 38])
+@pytest.mark.parametrize("sharpness", [0, 1e-30, 1e-3, 0.05, 20, 1e30])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("flow", FLOWS)
+def test_evaluate_rbf(backend, flow, size, sharpness, number):
+    rng = np.random.default_rng(number)
+    points = grid(*size) + FLOWS[flow](rng, *size)
+    centres = rng.uniform(-3, max(size), (number, 2))
+    weights, affine = rng.normal(0, 10, (number, 2)), rng.normal(0, 1, (2, 3))
+    given = points, centres, weights, affine, sharpness
+    actual = operations.evaluate_rbf(*given, backend=backend)
+    assert_close(actual, operations.evaluate_rbf(*given, backend="numpy"))
+
+
+def test_evaluate_rbf_of_many_centres_that_add_up(backend):
+    """Adding one number many times is where a float32 sum drifts most."""
+    given = np.zeros((1, 2)), np.zeros((100_000, 2)), np.full((100_000, 2), 0.7), np.zeros((2, 3))
+    actual = operations.evaluate_rbf(*given, 1, backend=backend)
+    assert_close(actual, operations.evaluate_rbf(*given, 1, backend="numpy"))
+
+
+def test_evaluate_rbf_where_squares_exceed_float32(backend):
+    """The Gaussian of sharpness 0 is 1 at any distance."""
+    given = [[3e38, -3e38]], [[-3e38, 3e38]], [[5, 7]], np.zeros((2, 3)), 0
+    assert_array_equal(operations.evaluate_rbf(*given, backend=backend), [[5, 7]])

@@ -101,3 +101,24 @@ def test_sampling_at_the_pixels_returns_the_field(backend, size):
     field = np.random.default_rng(0).normal(0, 1, (*size, 3)).astype(np.float32)
     y, x = np.mgrid[: size[0], : size[1]]
     assert_array_equal(operations.sample(field, np.stack([x, y], -1), backend=backend), field)
+
+
+@each_run_alike
+@given(st.data(), st.integers(1, 40), st.integers(-9, 9), st.integers(-9, 9))
+def test_gaussians_move_with_their_centres(backend, data, number, dx, dy):
+    points = data.draw(arrays(np.float32, (number, 2), elements=st.integers(-99, 99)))
+    rng = np.random.default_rng(number)
+    centres, weights, still = rng.integers(0, 9, (5, 2)), rng.normal(0, 5, (5, 2)), np.zeros((2, 3))
+    rest, by = (weights, still, 0.1), np.array([dx, dy])
+    moved = operations.evaluate_rbf(points + by, centres + by, *rest, backend=backend)
+    assert_array_equal(moved, operations.evaluate_rbf(points, centres, *rest, backend=backend))
+
+
+@each_run_alike
+@given(st.integers(1, 20))
+def test_a_single_gaussian_adds_its_weight_at_its_centre_only(backend, number):
+    centres = 10 * np.random.default_rng(number).permutation(number * 2).reshape(number, 2)
+    weights = np.random.default_rng(0).normal(0, 5, (number, 2))
+    identity = [[0, 1, 0], [0, 0, 1]]
+    mapped = operations.evaluate_rbf(centres, centres, weights, identity, 1, backend=backend)
+    assert_allclose(mapped, centres + weights, rtol=1e-6)

@@ -51,6 +51,11 @@ class Backend(Protocol):
     def distance_scan(self, queries: Any, corpus: Any, weights: Any, /) -> Any:
         """(K, P, C), (N, P, C), (P,) -> (K, N)."""
 
+    def evaluate_rbf(
+        self, points: Any, centres: Any, weights: Any, affine: Any, sharpness: float, /
+    ) -> Any:
+        """(P, 2), (N, 2), (N, 2), (2, 3) -> (P, 2)."""
+
 
 def list_devices(family: str) -> dict[str, str]:
     """Names for `get_backend` with what they stand for, of one of `BACKENDS`.

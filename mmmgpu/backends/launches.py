@@ -18,7 +18,7 @@ from mmmgpu.arrays import check_some_valid
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
-LANES = 16  # floats of a vector, as in kernels/blend and kernels/distance_scan
+LANES = 16  # floats of a vector, as in kernels/blend, distance_scan and rbf
 TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
 
 
@@ -139,6 +139,15 @@ class Launches(ABC):
 
         self.split(rows, scan)
         return distance
+
+    def evaluate_rbf(
+        self, points: Any, centres: Any, weights: Any, affine: Any, sharpness: float
+    ) -> Any:
+        number, terms = points.shape[0], centres.shape[0]
+        mapped = self.empty(number, 2)
+        inputs = [points, centres, weights, affine, number, terms, float(sharpness)]
+        self.launch_all("rbf.evaluate_rbf", math.ceil(number / LANES), inputs, [mapped])
+        return mapped
 
     def _coarser(self, level: Level) -> Level:
         """An uninitialised level of half the size; its weights are numbers of valid pixels."""

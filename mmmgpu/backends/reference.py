@@ -62,6 +62,16 @@ class Reference:
                 distance[k, n] = np.sqrt(((query - frame) ** 2).sum(axis=-1)) @ weights
         return distance
 
+    def evaluate_rbf(
+        self, points: F32, centres: F32, weights: F32, affine: F32, sharpness: float
+    ) -> F32:
+        p = points.astype(np.float64)
+        mapped = p @ affine[:, 1:].T + affine[:, 0]
+        for centre, weight in zip(centres, weights, strict=True):
+            phi = np.exp(-np.float64(np.float32(sharpness)) * ((p - centre) ** 2).sum(axis=-1))
+            mapped += phi[:, None] * weight
+        return mapped.astype(np.float32)
+
 
 def _splat(field: F32, flow: F32) -> tuple[F32, F32]:
     """Forward warp of one field (H, W, C) along one flow (H, W, 2)."""

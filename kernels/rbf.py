@@ -1,0 +1,56 @@
+"""A map made of Gaussians and an affine part (CE05, Eq. 6): 16 points a thread.
+
+Gaussians in float32, sums in float64. In the last thread lanes beyond the points do the last point
+again, and are not written.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+LANES = 16
+FAR = wp.constant(3.0e38)  # squares beyond float32 stay finite: 0 times them is 0
+vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
+vec16d = wp.types.vector(length=LANES, dtype=wp.float64)
+
+
+@wp.kernel
+def evaluate_rbf(
+    points: wp.array[float],  # (P, 2) = (x, y) [px]
+    centres: wp.array[float],  # (N, 2) [px]
+    weights: wp.array[float],  # (N, 2) [px]
+    affine: wp.array[float],  # (2, 3), columns for 1, x and y
+    number: int,  # P
+    terms: int,  # N
+    sharpness: float,  # [1/px^2]
+    first: int,
+    count: int,
+    # outputs
+    mapped: wp.array[float],  # (P, 2) [px]
+):
+    tid = wp.tid()
+    if tid >= count:
+        return
+    start = (first + tid) * LANES
+    x = vec16()
+    y = vec16()
+    for lane in range(LANES):
+        p = wp.min(start + lane, number - 1)
+        x[lane] = points[2 * p]
+        y[lane] = points[2 * p + 1]
+    u = vec16d(wp.float64(affine[0]))
+    u += wp.float64(affine[1]) * vec16d(x) + wp.float64(affine[2]) * vec16d(y)
+    v = vec16d(wp.float64(affine[3]))
+    v += wp.float64(affine[4]) * vec16d(x) + wp.float64(affine[5]) * vec16d(y)
+    for k in range(terms):
+        dx = x - vec16(centres[2 * k])
+        dy = y - vec16(centres[2 * k + 1])
+        phi = wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy)
+        for lane in range(LANES):
+            phi[lane] = wp.exp(-sharpness * wp.min(phi[lane], FAR))
+        wide = vec16d(phi)
+        u += wp.float64(weights[2 * k]) * wide
+        v += wp.float64(weights[2 * k + 1]) * wide
+    for lane in range(wp.min(LANES, number - start)):
+        mapped[2 * (start + lane)] = float(u[lane])
+        mapped[2 * (start + lane) + 1] = float(v[lane])
