@@ -9,17 +9,27 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mmmgpu import performer
+    from mmmgpu.adaptation import adapt
     from mmmgpu.aligner import align_speech
     from mmmgpu.alignments import Alignment, Segment, read_alignment
     from mmmgpu.backends import BACKENDS, get_backend
+    from mmmgpu.correspondence import rbf_correspondence
     from mmmgpu.errors import InputError
     from mmmgpu.evaluation import evaluate
     from mmmgpu.model_files import load
     from mmmgpu.models import Model
-    from mmmgpu.operations import blend, distance_scan, fill_holes, forward_warp, sample
+    from mmmgpu.operations import (
+        blend,
+        distance_scan,
+        evaluate_rbf,
+        fill_holes,
+        forward_warp,
+        sample,
+    )
     from mmmgpu.reconstruction import reconstruct
     from mmmgpu.speaking import speak
     from mmmgpu.training import train
+    from mmmgpu.transferring import transfer
     from mmmgpu.voices import say
 
 __version__ = "0.1.0"
@@ -31,36 +41,50 @@ __all__ = [
     "Model",
     "Segment",
     "__version__",
+    "adapt",
     "align_speech",
     "blend",
     "distance_scan",
     "evaluate",
+    "evaluate_rbf",
     "fill_holes",
     "forward_warp",
     "get_backend",
     "load",
     "performer",
+    "rbf_correspondence",
     "read_alignment",
     "reconstruct",
     "sample",
     "say",
     "speak",
     "train",
+    "transfer",
 ]
 
 _HOMES = {
+    "adaptation": ["adapt"],
     "aligner": ["align_speech"],
     "alignments": ["Alignment", "Segment", "read_alignment"],
     "backends": ["BACKENDS", "get_backend"],
+    "correspondence": ["rbf_correspondence"],
     "errors": ["InputError"],
     "evaluation": ["evaluate"],
     "model_files": ["load"],
     "models": ["Model"],
-    "operations": ["blend", "distance_scan", "fill_holes", "forward_warp", "sample"],
+    "operations": [
+        "blend",
+        "distance_scan",
+        "evaluate_rbf",
+        "fill_holes",
+        "forward_warp",
+        "sample",
+    ],
     "performer": [],  # the module itself
     "reconstruction": ["reconstruct"],
     "speaking": ["speak"],
     "training": ["train"],
+    "transferring": ["transfer"],
     "voices": ["say"],
 }
 

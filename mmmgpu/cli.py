@@ -8,7 +8,18 @@ from typing import Annotated
 import typer
 
 from mmmgpu import __version__
-from mmmgpu.commands import align, demo, evaluate, info, reconstruct, speak, train
+from mmmgpu.commands import (
+    adapt,
+    align,
+    demo,
+    evaluate,
+    info,
+    mark,
+    reconstruct,
+    speak,
+    train,
+    transfer,
+)
 from mmmgpu.commands.endings import INTERRUPTED, guarded, prompt_interrupts
 
 app = typer.Typer(
@@ -50,6 +61,9 @@ for _command, _example in (
     (reconstruct.reconstruct, reconstruct.EXAMPLE),
     (speak.speak, speak.EXAMPLE),
     (evaluate.evaluate, evaluate.EXAMPLE),
+    (mark.mark, mark.EXAMPLE),
+    (transfer.transfer, transfer.EXAMPLE),
+    (adapt.adapt, adapt.EXAMPLE),
     (info.info, info.EXAMPLE),
 ):
     app.command(epilog=_example)(guarded(_command))

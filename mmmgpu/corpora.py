@@ -70,3 +70,18 @@ def _open_clip(path: Path, alignments: Path, sync: float) -> Clip:
     alignment = read_alignment(found)
     check_against(alignment, info.duration, found)
     return Clip(path, info, shift(alignment, sync) if sync else alignment)
+
+
+def check_rates(corpus: Sequence[Clip]) -> None:
+    """All clips have one frame rate.
+
+    Raises:
+        InputError: Of the first clip that has another.
+    """
+    rate = corpus[0].info.fps
+    for clip in corpus:
+        if abs(clip.info.fps / rate - 1) > 0.001:
+            raise InputError(
+                f"{clip.path}: has {float(clip.info.fps):g} frames/s but {corpus[0].path.name} "
+                f"{float(rate):g}; convert the clips to one rate"
+            )

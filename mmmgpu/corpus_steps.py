@@ -16,17 +16,35 @@ from numpy.typing import NDArray
 from mmmgpu.analysis import analyze, prepare_analysis, thumbnail
 from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.basis import Basis
-from mmmgpu.checkpoints import finished_steps_only, read_step, write_step
+from mmmgpu.checkpoints import (
+    fingerprint,
+    finished_steps_only,
+    open_checkpoints,
+    read_step,
+    write_step,
+)
 from mmmgpu.corpora import Clip
 from mmmgpu.errors import InputError
+from mmmgpu.models import Calm
+from mmmgpu.phonemes import Utterance
 from mmmgpu.processes import Tick, Work, share_out
 from mmmgpu.progress import progress_bar
 from mmmgpu.regions import Region, mouth_mask
-from mmmgpu.tracks import Reference, Track, crop, crops, track_clip
+from mmmgpu.tracks import Reference, Track, crop, crops, rebase, track_clip
 from mmmgpu.videos import read_frames
 
 Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
+
+
+def work_folder(out: Path, corpus: Sequence[Clip], given: Mapping[str, Any]) -> Path:
+    """The folder beside `out` for the finished steps of a job on `corpus`.
+
+    given: options and whatever else the steps depend on, as JSON values.
+    """
+    said = [[list(phone) for phone in clip.alignment.phones] for clip in corpus]
+    mark = fingerprint([clip.path for clip in corpus], {**given, "said": said})
+    return open_checkpoints(out.with_name(out.name + ".work"), mark)
 
 
 def for_all(
@@ -165,6 +183,15 @@ class Frames:
             i -= clip.info.frames
         raise IndexError(i)
 
+    def number(self, name: str, t: int) -> int:
+        """The number in the row of frame `t` of the clip called `name`."""
+        before = 0
+        for clip in self.clips:
+            if clip.path.name == name:
+                return before + t
+            before += clip.info.frames
+        raise KeyError(name)
+
     def crops(self, numbers: Sequence[int], region: Region) -> dict[int, F32]:
         """The regions of some frames, each clip read once; `numbers` is sorted."""
         found, first = {}, 0
@@ -178,3 +205,55 @@ class Frames:
                         found[first + t] = crop(frame, track.poses[t], track, region)
             first += clip.info.frames
         return found
+
+
+def rebased_frames(
+    corpus: Sequence[Clip], tracks: Mapping[str, Track], name: str, t: int
+) -> Frames:
+    """The tracked clips as frame `t` of the clip called `name` sees them: its pose is the identity.
+
+    Its gain becomes 1 and its offset 0.
+
+    Raises:
+        InputError: That clip was not tracked.
+    """
+    if name not in tracks:
+        raise InputError(f"{name}: holds the reference frame, but its head was not found there")
+    first = tracks[name]
+    pose = first.poses[t]
+    rebased = {n: rebase(track, pose, first.gain, first.offset) for n, track in tracks.items()}
+    return Frames([clip for clip in corpus if clip.path.name in tracks], rebased)
+
+
+def tracking_notes(frames: Frames, skipped: Mapping[str, str]) -> dict[str, Any]:
+    """What tracking found, for reports: JSON values."""
+    tracks = frames.tracks.values()
+    return {
+        "clips": [clip.path.name for clip in frames.clips],
+        "skipped": dict(skipped),
+        "frames": int(frames.registered.size),
+        "unregistered_frames": int((~frames.registered).sum()),
+        "registration_residual_px": float(np.mean([t.residual for t in tracks])),
+    }
+
+
+def utterances_of(frames: Frames, coordinates: Sequence[Floats]) -> list[Utterance]:
+    """One stream of every clip, (T, d) each, without the frames whose head was not found."""
+    utterances = []
+    for clip, z in zip(frames.clips, coordinates, strict=True):
+        good = np.flatnonzero(frames.tracks[clip.path.name].registered)
+        labels = clip.labels
+        utterances.append(Utterance(z[good].astype(np.float64), [labels[t] for t in good]))
+    return utterances
+
+
+def calmest(frames: Frames) -> Calm:
+    """The clip in which the head moves least, as a background."""
+
+    def unrest(clip: Clip) -> float:
+        poses = frames.tracks[clip.path.name].poses
+        return float(np.abs(poses[:, :2, 2] - poses[:, :2, 2].mean(axis=0)).mean())
+
+    clip = min(frames.clips, key=unrest)
+    data = np.fromfile(clip.path, np.uint8)
+    return Calm(data, clip.path.suffix, frames.tracks[clip.path.name])

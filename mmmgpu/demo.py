@@ -1,4 +1,4 @@
-"""Everything in one go, on the built-in performer: film, learn, speak, reconstruct, judge, report.
+"""Everything in one go, on built-in performers: film, learn, speak, reconstruct, judge, report.
 
 Filming and training continue where a killed run stopped; the rest takes less than a minute.
 """
@@ -21,6 +21,7 @@ from mmmgpu.alignments import read_alignment
 from mmmgpu.backends import default_threads
 from mmmgpu.checkpoints import fingerprint
 from mmmgpu.corpora import open_corpus
+from mmmgpu.demo_second import SECOND, Second, add_second_person
 from mmmgpu.evaluation import evaluate, measure_reconstruction
 from mmmgpu.figures import captions
 from mmmgpu.files import require_folder, write_json
@@ -86,6 +87,7 @@ def make_demo(
     out: Path,
     *,
     seed: int = SEED,
+    second: Second = SECOND,
     script: Script = SCRIPT,
     prototypes: int = 46,
     stage: Stage = STAGE,
@@ -94,12 +96,14 @@ def make_demo(
     """Film a performer, learn it, and let the model speak; leave all in the folder `out`.
 
     There will be ``corpus/``, ``model.mmm``, ``spoken.mp4``, ``side-by-side.mp4`` (real |
-    reconstructed | spoken), ``report.html`` and ``results.json``. A killed run continues. The last
-    line on the standard output says what to open.
+    reconstructed | spoken), ``report.html``, what `demo_second` makes of a second performer,
+    ``second-side-by-side.mp4`` (before | after adaptation) and ``results.json``. A killed run
+    continues. The last line on the standard output says what to open.
 
     Args:
         out: Made if it does not exist; files of these names in it are replaced.
         seed: Which performer, and of everything random.
+        second: The second performer, to whom the model is transferred.
         script: What is said.
         prototypes: M.
         stage: Size and rate of the pictures, and the voice.
@@ -145,15 +149,29 @@ def make_demo(
             videos=videos,
             backend=backend,
         )
+    transferred, pair = add_second_person(
+        out,
+        model,
+        corpus,
+        speech,
+        second=second,
+        stage=stage,
+        step=steps.step,
+        threads=default_threads(),
+        backend=backend,
+    )
+    both = out / "second-side-by-side.mp4"
+    write_side_by_side(pair, both, mouth=load(out / "adapted.mmm").basis.region.mouth)
     results = {
         "seed": seed,
         "sentence": script.new,
         "training": model.notes,
         "evaluation": judged,
+        "second": transferred,
         "seconds": steps.seconds,
     }
     write_json(out / "results.json", results)
-    print(f"Open {page} in a browser; the new sentence alone is {out / 'spoken.mp4'}")
+    print(f"Open {page} in a browser; the second person speaks in {both}")
     return results
 
 

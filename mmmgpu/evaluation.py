@@ -4,7 +4,7 @@ All intervals are 95 % over clips. Landmarks serve measuring only, where a folde
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.errors import InputError
 from mmmgpu.landmarks import (
@@ -24,9 +25,11 @@ from mmmgpu.landmarks import (
     read_landmarks,
 )
 from mmmgpu.models import Model, project_on_simplex, trajectories
-from mmmgpu.parallel import one_thread_each
+from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.pictures import psnr, ssim
+from mmmgpu.progress import progress
 from mmmgpu.reconstruction import Analysed, analyse_clip
+from mmmgpu.speaking import focused
 from mmmgpu.statistics import (
     Interval,
     correlation,
@@ -36,12 +39,13 @@ from mmmgpu.statistics import (
     speech_frames,
     variance_ratio,
 )
+from mmmgpu.synthesis import synthesize_one
+from mmmgpu.tracks import crops
 from mmmgpu.videos import read_frames
 
+F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-KINDS = ("pooled", "trained")
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ def evaluate(
     *,
     sync: float = 0.0,
     landmarks: str | os.PathLike[str] | None = None,
+    pictures: bool = False,
     backend: str = "warp",
 ) -> dict[str, Any]:
     """Synthesis from the phones of `clips` against what was really said there.
@@ -75,12 +80,15 @@ def evaluate(
         alignments: Folder of alignments, or one file.
         sync: [s] as in training.
         landmarks: Folder of landmark files (see `mmmgpu.landmarks`), for distances in pixels.
+        pictures: Whether to render every frame too, and compare it with the real one.
         backend: A name for `mmmgpu.backends.get_backend`.
 
     Returns:
         JSON values: for alpha and beta the RMS error with pooled and trained phoneme models, over
         all and over speech frames, with the paired gain; correlations and variance ratios
-        synthetic/real; with landmarks also the lips' distances, opening and jitter.
+        synthetic/real; with landmarks also the lips' distances, opening and jitter; with pictures
+        the PSNR [dB] of speech frames under the mouth mask. A model with alternatives is compared
+        with them too.
 
     Raises:
         InputError: A clip, an alignment or the landmarks cannot be used.
@@ -97,7 +105,15 @@ def evaluate(
         result[stream] = _stream(spoken, stream)
     if points is not None:
         result["lips"] = _lips(model, spoken, *points)
+    if pictures:
+        with one_thread_each():
+            result["mouth_psnr_db_speech"] = _pictures(model, spoken, backend)
     return result
+
+
+def kinds_of(model: Model) -> list[str]:
+    """The phoneme models that are compared: before and after training, and the alternatives."""
+    return ["pooled", "trained", *model.alternatives]
 
 
 def _speak(model: Model, clip: Clip, backend: str) -> _Spoken:
@@ -109,8 +125,8 @@ def _speak(model: Model, clip: Clip, backend: str) -> _Spoken:
     analysed = analyse_clip(model, clip.path, backend=backend)
     labels = clip.labels
     made = {}
-    for kind in KINDS:
-        alpha, beta = trajectories(model, labels, trained=kind == "trained")
+    for kind in kinds_of(model):
+        alpha, beta = trajectories(model, labels, kind=kind)
         made[kind, "alpha"], made[kind, "beta"] = alpha, beta
     real = {"alpha": analysed.alpha, "beta": analysed.beta}
     return _Spoken(clip, analysed, speech_frames(labels), real, made)
@@ -119,14 +135,16 @@ def _speak(model: Model, clip: Clip, backend: str) -> _Spoken:
 def _stream(spoken: Sequence[_Spoken], stream: str) -> dict[str, Any]:
     """Errors of one stream over all and over speech frames."""
     result: dict[str, Any] = {}
+    kinds = [kind for kind, name in spoken[0].made if name == stream]
     for part in ("all", "speech"):
-        rms = {kind: [_rms(s, kind, stream, part) for s in spoken] for kind in KINDS}
+        rms = {kind: [_rms(s, kind, stream, part) for s in spoken] for kind in kinds}
         real = _joined([s.real[stream] for s in spoken], spoken, part)
         entry: dict[str, Any] = {
-            "rms": {kind: _interval(interval(rms[kind])) for kind in KINDS},
+            "rms": {kind: _interval(interval(rms[kind])) for kind in kinds},
             "rms_gain": _interval(paired_interval(rms["pooled"], rms["trained"])),
+            **_gains_over("rms", rms),
         }
-        for kind in KINDS:
+        for kind in kinds:
             y = _joined([s.made[kind, stream] for s in spoken], spoken, part)
             entry[f"correlation_{kind}"] = _typical(correlation(y, real), real)
             entry[f"variance_ratio_{kind}"] = float(y.var(axis=0).sum() / real.var(axis=0).sum())
@@ -140,6 +158,13 @@ def _stream(spoken: Sequence[_Spoken], stream: str) -> dict[str, Any]:
             entry["rms_trained_on_simplex"] = _interval(interval(projected))
         result[part] = entry
     return result
+
+
+def _gains_over(name: str, values: Mapping[str, list[float]]) -> dict[str, Any]:
+    """What the trained models gain over each alternative: paired differences, positive is good."""
+    others = [kind for kind in values if kind not in ("analysed", "pooled", "trained")]
+    gains = {k: _interval(paired_interval(values[k], values["trained"])) for k in others}
+    return {f"{name}_gain_over": gains} if gains else {}
 
 
 def _part(s: _Spoken, kind: str, stream: str, part: str) -> tuple[Floats, Floats]:
@@ -185,8 +210,9 @@ def _lips(
     model: Model, spoken: Sequence[_Spoken], origin: Floats, points: Sequence[Floats]
 ) -> dict[str, Any]:
     """Distances [px of the frame], opening [px of the reference] and jitter of the lips."""
-    series: dict[str, list[Floats]] = {k: [] for k in ("real", "analysed", *KINDS)}
-    distance: dict[str, list[float]] = {k: [] for k in ("analysed", *KINDS)}
+    kinds = kinds_of(model)
+    series: dict[str, list[Floats]] = {k: [] for k in ("real", "analysed", *kinds)}
+    distance: dict[str, list[float]] = {k: [] for k in ("analysed", *kinds)}
     for s, real in zip(spoken, points, strict=True):
         poses = s.analysed.track.poses
         series["real"].append(carried(np.asarray(np.linalg.inv(poses), np.float64), real))
@@ -199,6 +225,7 @@ def _lips(
     result: dict[str, Any] = {
         "distance_px_speech": {k: _interval(interval(v)) for k, v in distance.items()},
         "distance_gain_px": _interval(paired_interval(distance["pooled"], distance["trained"])),
+        **_gains_over("distance_px", distance),
         "jitter_px_silence": {k: _jitter(v, spoken) for k, v in series.items()},
     }
     opening = {k: [lip_opening(p)[:, None] for p in v] for k, v in series.items()}
@@ -219,6 +246,48 @@ def _lips(
         for k, v in opening.items()
     }
     return result
+
+
+def _pictures(model: Model, spoken: Sequence[_Spoken], backend: str) -> dict[str, Any]:
+    """PSNR [dB] of rendered speech frames under w_t, from the mean squared error of each clip."""
+    found: dict[str, list[float]] = {kind: [] for kind in kinds_of(model)}
+    for s in spoken:
+        if not s.speech.any():
+            continue
+        for kind, error in _picture_errors(model, s, backend).items():
+            found[kind].append(float(-10 * np.log10(max(error, 1e-10))))
+    gain = paired_interval(found["trained"], found["pooled"])
+    return {
+        **{kind: _interval(interval(values)) for kind, values in found.items()},
+        "gain": _interval(gain),
+        "gain_over": {
+            kind: _interval(paired_interval(found["trained"], found[kind]))
+            for kind in model.alternatives
+        },
+    }
+
+
+def _picture_errors(model: Model, s: _Spoken, backend: str) -> dict[str, float]:
+    """Mean squared error under w_t of the speech frames of one clip, for each kind."""
+    kernels, basis, track = get_backend(backend, 1), model.basis, s.analysed.track
+    weight = basis.w_t[..., None] / (3 * basis.w_t.sum())
+    kinds = kinds_of(model)
+    betas = {kind: focused(project_on_simplex(s.made[kind, "beta"])) for kind in kinds}
+
+    def one(item: tuple[int, F32], _: Cancelled) -> list[float]:
+        t, real = item
+        made = (
+            synthesize_one(basis, s.made[kind, "alpha"][t], betas[kind][t], kernels)
+            for kind in kinds
+        )
+        return [float((weight * (image - real) ** 2).sum()) for image in made]
+
+    seen = enumerate(crops(s.clip.path, track, basis.region))
+    frames = ((t, image) for t, image in seen if s.speech[t])
+    rendered = map_ordered(one, frames, threads=default_threads())
+    label, total = f"render {s.clip.path.name}", int(s.speech.sum())
+    errors = np.array(list(progress(rendered, label, total=total)))
+    return dict(zip(kinds, errors.mean(axis=0).tolist(), strict=True))
 
 
 def _jitter(series: Sequence[Floats], spoken: Sequence[_Spoken]) -> float:

@@ -139,6 +139,10 @@ def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
         wanted[f"{name}.smoothness"] = ((d,), "f8")
         wanted[f"{name}.training"] = ((len(tensors[f"{name}.training"]), d), "f8")
         wanted[f"{name}.validation"] = (tensors[f"{name}.validation"].shape, "f8")
+        if facts[name]["full_covariance"]:
+            wanted[f"{name}.covariance"] = ((phones, d, d), "f8")
+        for other in facts["alternatives"]:
+            wanted[f"{name}.{other}.mean"] = ((phones, d), "f8")
     for name, (shape, kind) in wanted.items():
         tensor = tensors[name]
         if tensor.shape != shape or tensor.dtype != np.dtype(kind):
@@ -148,6 +152,10 @@ def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
             )
         if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
             raise InputError(f"{path}: tensor {name} holds NaN or infinity; train the model again")
+        if name.endswith(".covariance") and not (np.linalg.eigvalsh(tensor) > 0).all():
+            raise InputError(
+                f"{path}: tensor {name} must be positive definite; train the model again"
+            )
         if name.endswith(".variance") and not (tensor > 0).all():
             raise InputError(f"{path}: tensor {name} must be above zero; train the model again")
         if name in ("calm.poses", "head.to_frame") and not np.linalg.det(tensor).all():
@@ -166,12 +174,17 @@ def _facts(model: Model) -> dict[str, Any]:
         "calm": {"suffix": model.calm.suffix, "residual": model.calm.track.residual},
         "alpha": _stream_facts(model.alpha),
         "beta": _stream_facts(model.beta),
+        "alternatives": sorted(model.alternatives),
         "notes": model.notes,
     }
 
 
 def _stream_facts(stream: TrainedStream) -> dict[str, Any]:
-    return {"labels": list(stream.trained.labels), "constants": vars(stream.constants)}
+    return {
+        "labels": list(stream.trained.labels),
+        "constants": vars(stream.constants),
+        "full_covariance": stream.trained.covariance is not None,
+    }
 
 
 def _tensors(model: Model) -> Tensors:
@@ -203,6 +216,10 @@ def _tensors(model: Model) -> Tensors:
         tensors[f"{name}.smoothness"] = stream.smoothness
         tensors[f"{name}.training"] = stream.history.training
         tensors[f"{name}.validation"] = stream.validation
+        if stream.trained.covariance is not None:
+            tensors[f"{name}.covariance"] = stream.trained.covariance
+    for other, (alpha, beta) in model.alternatives.items():
+        tensors[f"alpha.{other}.mean"], tensors[f"beta.{other}.mean"] = alpha, beta
     return tensors
 
 
@@ -226,13 +243,23 @@ def _assemble(t: Tensors, facts: dict[str, Any]) -> Model:
         sources=tuple((str(clip), int(frame)) for clip, frame in facts["sources"]),
         calm=Calm(t["calm.data"], facts["calm"]["suffix"], track),
         notes=facts["notes"],
+        alternatives={
+            other: (t[f"alpha.{other}.mean"], t[f"beta.{other}.mean"])
+            for other in facts["alternatives"]
+        },
     )
 
 
 def _stream(name: str, t: Tensors, facts: dict[str, Any]) -> TrainedStream:
     labels, count = tuple(facts[name]["labels"]), t[f"{name}.count"]
     pooled, trained = (
-        PhonemeModels(labels, t[f"{name}.{kind}.mean"], t[f"{name}.{kind}.variance"], count)
+        PhonemeModels(
+            labels,
+            t[f"{name}.{kind}.mean"],
+            t[f"{name}.{kind}.variance"],
+            count,
+            t.get(f"{name}.covariance"),
+        )
         for kind in ("pooled", "trained")
     )
     return TrainedStream(

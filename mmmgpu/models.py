@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.basis import Basis
+from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.phones import stand_in
 from mmmgpu.tracks import Reference, Track
 from mmmgpu.trajectories import synthesize_trajectory
@@ -46,6 +47,8 @@ class Model:
     sources: clip name and frame number of every prototype.
     calm: background for `speak`.
     notes: what training found and chose, for reports; plain JSON values.
+    alternatives: by name, the means (P, M - 1) and (P, M) that other ways of adaptation gave, for
+        comparison; all else of the phoneme models is that of the trained ones.
     """
 
     basis: Basis
@@ -57,6 +60,7 @@ class Model:
     sources: tuple[tuple[str, int], ...]
     calm: Calm
     notes: dict[str, Any] = field(default_factory=dict)
+    alternatives: dict[str, tuple[Floats, Floats]] = field(default_factory=dict)
 
     @property
     def frame_size(self) -> tuple[int, int]:
@@ -71,25 +75,35 @@ class Model:
 
 
 def trajectories(
-    model: Model, labels: Sequence[str], *, trained: bool = True
+    model: Model, labels: Sequence[str], *, kind: str = "trained"
 ) -> tuple[Floats, Floats]:
     """Eq. 3 for both streams: alpha (T, M - 1) and beta (T, M) of a row of phones.
 
     labels: phone of every frame at `model.fps`, length T.
-    trained: False uses the pooled estimates in place of the trained ones.
+    kind: "trained"; "pooled", the estimates before training; or one of `model.alternatives`.
     """
-    streams = []
-    for stream in (model.alpha, model.beta):
-        streams.append(
-            synthesize_trajectory(
-                stream.trained if trained else stream.pooled,
-                labels,
-                smoothness=stream.smoothness,
-                order=stream.constants.order,
-                stand_in=stand_in,
-            )
+    alpha, beta = (
+        synthesize_trajectory(
+            models,
+            labels,
+            smoothness=stream.smoothness,
+            order=stream.constants.order,
+            stand_in=stand_in,
         )
-    return streams[0], streams[1]
+        for models, stream in zip(phonemes_of(model, kind), (model.alpha, model.beta), strict=True)
+    )
+    return alpha, beta
+
+
+def phonemes_of(model: Model, kind: str = "trained") -> tuple[PhonemeModels, PhonemeModels]:
+    """The Gaussians of alpha and of beta; for `kind` see `trajectories`."""
+    if kind == "pooled":
+        return model.alpha.pooled, model.beta.pooled
+    alpha, beta = model.alpha.trained, model.beta.trained
+    if kind == "trained":
+        return alpha, beta
+    means = model.alternatives[kind]
+    return replace(alpha, mean=means[0]), replace(beta, mean=means[1])
 
 
 def project_on_simplex(beta: Floats) -> Floats:

@@ -1,16 +1,19 @@
-"""Phoneme models: one Gaussian N(mu_p, Sigma_p), Sigma_p diagonal, for each phone of a stream.
+"""Phoneme models: one Gaussian N(mu_p, Sigma_p) for each phone of a stream.
 
-A stream is the sequence of one kind of model coordinates: alpha (movement) or beta (texture). The
-two are modelled apart by this same code. What is here is the statistics of the frames of each
-phone; how the models become a trajectory is `mmmgpu.trajectories`, how they are refined against
-real trajectories is `mmmgpu.trajectory_training`.
+Sigma_p is diagonal, or full where the models were carried to other prototypes (see
+`mmmgpu.reselection`). A stream is the sequence of one kind of model coordinates: alpha (movement)
+or beta (texture). The two are modelled apart by this same code. What is here is the statistics of
+the frames of each phone; how the models become a trajectory is `mmmgpu.trajectories`, how they are
+refined against real trajectories is `mmmgpu.trajectory_training`, how they are adapted to another
+person is `mmmgpu.adaptation_folds`.
 
 Source: Chang & Ezzat, "Transferable Videorealistic Speech Animation" (SCA 2005), section 3.2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
@@ -18,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mmmgpu.errors import InputError
+from mmmgpu.phones import SIL
 
 StandIn = Callable[
     [str, AbstractSet[str]], str
@@ -53,19 +57,22 @@ class Utterance:
 
 @dataclass(frozen=True)
 class PhonemeModels:
-    """N(mu_p, diag sigma2_p) for every phone p of one stream.
+    """N(mu_p, Sigma_p) for every phone p of one stream; Sigma_p = diag sigma2_p unless it is full.
 
     Attributes:
         labels: The P phones, sorted.
         mean: mu_p [model coordinates], shape (P, d).
         variance: sigma2_p [model coordinates squared], shape (P, d), all above zero.
         count: Frames of each phone, shape (P,).
+        covariance: Full Sigma_p, shape (P, d, d), positive definite; `variance` is its diagonal.
+            None: Sigma_p is diagonal.
     """
 
     labels: tuple[str, ...]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
     count: NDArray[np.int64]
+    covariance: NDArray[np.float64] | None = None
 
     def index(self, labels: Sequence[str], *, stand_in: StandIn | None = None) -> NDArray[np.int64]:
         """Row of each label, shape (T,).
@@ -93,6 +100,14 @@ class PhonemeModels:
     def typical_variance(self) -> NDArray[np.float64]:
         """Variance within a phone, averaged over the frames: sum_p n_p sigma2_p / n, shape (d,)."""
         return np.average(self.variance, axis=0, weights=self.count)
+
+    @property
+    def precision(self) -> NDArray[np.float64]:
+        """Sigma_p^-1: its diagonal, shape (P, d), or if the models are full (P, d, d)."""
+        if self.covariance is None:
+            return np.asarray(1 / self.variance)
+        inverse = np.linalg.inv(self.covariance)
+        return np.asarray((inverse + inverse.transpose(0, 2, 1)) / 2)
 
 
 def pool(
@@ -122,7 +137,7 @@ def pool(
     frames = np.maximum(count, 1)[:, None]
     mean = np.where(count[:, None], _sum_by(phone, z, len(names)) / frames, z.mean(axis=0))
     spread = _sum_by(phone, (z - mean[phone]) ** 2, len(names)) / frames
-    whole = _positive(z.var(axis=0))
+    whole = positive(z.var(axis=0))
     variance = np.where(count[:, None], np.maximum(spread, floor_share * whole), whole)
     return PhonemeModels(tuple(names.tolist()), mean, variance, count)
 
@@ -144,7 +159,7 @@ def _sum_by(group: NDArray[np.int64], x: NDArray[np.float64], n: int) -> NDArray
     return total
 
 
-def _positive(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+def positive(variance: NDArray[np.float64]) -> NDArray[np.float64]:
     """`variance` (d,) with `TINY_SHARE` of its mean as the least; 1 where nothing moves at all."""
     least = TINY_SHARE * variance.mean()
     return np.maximum(variance, least) if least > 0 else np.ones_like(variance)
@@ -177,3 +192,59 @@ def segment_durations(
     """
     lengths = np.diff(np.r_[segment_starts(labels, segments), len(labels)])
     return np.repeat(lengths, lengths)
+
+
+def cut_utterance(utterance: Utterance, pieces: int) -> list[Utterance]:
+    """At most `pieces` parts of about one length, cut between segments.
+
+    Raises:
+        InputError: The utterance is a single segment.
+    """
+    starts = segment_starts(utterance.labels, utterance.segments)[1:].tolist()
+    n = len(utterance.z)
+    if not starts:
+        raise InputError(
+            "utterances: a single clip of a single segment cannot be divided into one part to "
+            "train on and one to judge by; give more speech"
+        )
+    wanted = [n * i / pieces for i in range(1, pieces)]
+    cuts = sorted({min(starts, key=lambda t: abs(t - w)) for w in wanted})
+    return [_frames(utterance, a, b) for a, b in zip([0, *cuts], [*cuts, n], strict=True)]
+
+
+def _frames(u: Utterance, start: int, end: int) -> Utterance:
+    segments = None if u.segments is None else u.segments[start:end]
+    return Utterance(u.z[start:end], u.labels[start:end], segments)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How many frames there are of each phone, as CE05 section 6 counts them.
+
+    Attributes:
+        frames: Frames of each phone of the inventory.
+        per_phone: Their mean, over all phones of the inventory.
+        per_phone_without_silence: The mean over all of them but SIL.
+        unseen: Phones of the inventory without a frame.
+        others: Frames of the phones that are not of the inventory.
+    """
+
+    frames: dict[str, int]
+    per_phone: float
+    per_phone_without_silence: float
+    unseen: tuple[str, ...]
+    others: dict[str, int]
+
+
+def coverage(labels: Iterable[str], phones: Sequence[str]) -> Coverage:
+    """Count the frames of each of `phones` in `labels`, the phones of all frames of all clips."""
+    count = Counter(labels)
+    frames = {phone: count.pop(phone, 0) for phone in phones}
+    speech = [n for phone, n in frames.items() if phone != SIL]
+    return Coverage(
+        frames=frames,
+        per_phone=sum(frames.values()) / max(len(frames), 1),
+        per_phone_without_silence=sum(speech) / max(len(speech), 1),
+        unseen=tuple(phone for phone, n in frames.items() if n == 0),
+        others=dict(sorted(count.items())),
+    )

@@ -28,6 +28,8 @@ CE05_CLASSES: Final[tuple[tuple[str, ...], ...]] = (
     ("SIL",),
 )
 
+CE05_PHONES: Final = tuple(phone for phones in CE05_CLASSES for phone in phones)
+
 # CMUdict's five that CE05 lacks: (nucleus, glide); the nucleus takes NUCLEUS_SHARE of the time.
 DIPHTHONGS: Final = MappingProxyType(
     {
@@ -228,10 +230,14 @@ def ce05_class(label: str) -> int:
 
     A label that is not of the inventory takes the class of its nearest phone (see `stand_in`).
     """
-    label = arpabet(label) or label
-    label = DIPHTHONGS.get(label, (label,))[0]
     class_of = {phone: i for i, phones in enumerate(CE05_CLASSES) for phone in phones}
-    return class_of[stand_in(label, class_of.keys())]
+    return class_of[stand_in(ce05_phone(label), class_of.keys())]
+
+
+def ce05_phone(label: str) -> str:
+    """Return `label` as CE05 has it: a diphthong as its nucleus, all else as it is."""
+    label = arpabet(label) or label
+    return DIPHTHONGS.get(label, (label,))[0]
 
 
 def look_alike_distance(a: str, b: str) -> float:

@@ -24,7 +24,7 @@ from mmmgpu.figures import (
     seen_through,
 )
 from mmmgpu.files import write_text
-from mmmgpu.models import Model, project_on_simplex, trajectories
+from mmmgpu.models import Model, phonemes_of, project_on_simplex, trajectories
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phones import SIL, VISEMES, arpabet
 from mmmgpu.report_parts import PAGE, figure, pair, small, tile, video
@@ -202,7 +202,7 @@ def _means(model: Model, backend: str) -> Iterator[tuple[str, int, NDArray[np.fl
     known = model.alpha.trained.labels
     for label in sorted(known, key=lambda p: _place(p, order)):
         count = int(model.alpha.trained.count[known.index(label)])
-        yield label, count, _mean_picture(model, label, backend, trained=True)
+        yield label, count, mean_picture(model, label, backend)
 
 
 def _place(label: str, order: Sequence[str]) -> tuple[int, str]:
@@ -210,11 +210,11 @@ def _place(label: str, order: Sequence[str]) -> tuple[int, str]:
     return (order.index(phone) if phone in order else len(order)), label
 
 
-def _mean_picture(model: Model, label: str, backend: str, *, trained: bool) -> NDArray[np.float32]:
-    alpha, beta = (
-        (stream.trained if trained else stream.pooled).mean[stream.trained.labels.index(label)]
-        for stream in (model.alpha, model.beta)
-    )
+def mean_picture(
+    model: Model, label: str, backend: str, *, kind: str = "trained"
+) -> NDArray[np.float32]:
+    """The mean of a phone as a picture, (h, w, 3) in [0, 1]; for `kind` see `trajectories`."""
+    alpha, beta = (m.mean[m.labels.index(label)] for m in phonemes_of(model, kind))
     return synthesize_one(
         model.basis, alpha, project_on_simplex(beta[None])[0], get_backend(backend)
     )
@@ -226,8 +226,8 @@ def _training(model: Model, backend: str) -> str:
     labels = [alpha.trained.labels[i] for i in np.argsort(-change)[:CHANGES_SHOWN]]
     pairs = "".join(
         pair(
-            small(_mean_picture(model, label, backend, trained=False)),
-            small(_mean_picture(model, label, backend, trained=True)),
+            small(mean_picture(model, label, backend, kind="pooled")),
+            small(mean_picture(model, label, backend)),
             (f"{label} before training", f"{label} after training"),
             f"{label}: before, after",
         )
@@ -255,8 +255,8 @@ def _training(model: Model, backend: str) -> str:
 
 def _movement(model: Model, held_out: Trajectory) -> str:
     made = {
-        name: trajectories(model, held_out.labels, trained=name == "after training")
-        for name in ("before training", "after training")
+        name: trajectories(model, held_out.labels, kind=kind)
+        for name, kind in (("before training", "pooled"), ("after training", "trained"))
     }
     panels = []
     for stream, name in enumerate(("alpha", "beta")):

@@ -86,10 +86,10 @@ def plan(model: Model, alignment: Alignment, *, articulation: float = 1.0) -> Tr
         scale_about(y, neutral, articulation)
         for y, neutral in zip(trajectories(model, labels), silent_mouth(model), strict=True)
     )
-    return Trajectory(tuple(labels), alpha, _focused(project_on_simplex(beta)), model.fps)
+    return Trajectory(tuple(labels), alpha, focused(project_on_simplex(beta)), model.fps)
 
 
-def _focused(beta: Floats) -> Floats:
+def focused(beta: Floats) -> Floats:
     """`beta` (T, M) with more of the strongest textures; continuous, so that nothing flickers.
 
     The mean texture of a phone mixes more prototypes than any frame shows, and the teeth of many

@@ -15,19 +15,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.checkpoints import fingerprint, open_checkpoints
-from mmmgpu.corpora import Clip, open_corpus
-from mmmgpu.corpus_steps import Frames, Thumbnails, analyse_corpus, track_corpus
-from mmmgpu.errors import InputError
-from mmmgpu.models import Calm, Model
+from mmmgpu.corpora import Clip, check_rates, open_corpus
+from mmmgpu.corpus_steps import (
+    Frames,
+    Thumbnails,
+    analyse_corpus,
+    calmest,
+    rebased_frames,
+    track_corpus,
+    tracking_notes,
+    utterances_of,
+    work_folder,
+)
+from mmmgpu.models import Model
 from mmmgpu.parallel import one_thread_each
-from mmmgpu.phonemes import Utterance
 from mmmgpu.phones import SIL
 from mmmgpu.progress import progress_bar
 from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordinates
 from mmmgpu.references import check_sound, find_reference, rebase_reference
-from mmmgpu.tracks import Reference, Track, frame_at, rebase
+from mmmgpu.tracks import frame_at
 from mmmgpu.trajectory_training import TrainedStream, fit_stream
 
 Floats = NDArray[np.float64]
@@ -79,32 +86,15 @@ def train(
     """
     out = Path(out)
     corpus = open_corpus([Path(c) for c in clips], Path(alignments), sync=options.sync)
-    _check_rates(corpus)
+    check_rates(corpus)
     if options.region is None:
         check_sound(corpus)
-    folder = _work_folder(out, corpus, options)
+    folder = work_folder(out, corpus, {"options": vars(options), "steps": 1})
     with one_thread_each():
         model = _Training(corpus, options, backend, folder).run()
     model.save(out)
     shutil.rmtree(folder)
     return model
-
-
-def _check_rates(corpus: Sequence[Clip]) -> None:
-    rate = corpus[0].info.fps
-    for clip in corpus:
-        if abs(clip.info.fps / rate - 1) > 0.001:
-            raise InputError(
-                f"{clip.path}: has {float(clip.info.fps):g} frames/s but {corpus[0].path.name} "
-                f"{float(rate):g}; convert the clips to one rate"
-            )
-
-
-def _work_folder(out: Path, corpus: Sequence[Clip], options: Options) -> Path:
-    said = [[list(phone) for phone in clip.alignment.phones] for clip in corpus]
-    given = {"options": vars(options), "said": said, "steps": 1}
-    mark = fingerprint([clip.path for clip in corpus], given)
-    return open_checkpoints(out.with_name(out.name + ".work"), mark)
 
 
 @dataclass(frozen=True)
@@ -127,11 +117,7 @@ class _Training:
         first = tracks[clip.path.name]
         kept = self.options.region is not None
         reference = rebase_reference(provisional, first, t, size, keep_box=kept)
-        rebased = {
-            name: rebase(track, first.poses[t], first.gain, first.offset)
-            for name, track in tracks.items()
-        }
-        frames = Frames(used, rebased)
+        frames = rebased_frames(used, tracks, clip.path.name, t)
         flow = self.options.flow
         basis = prototype_basis(
             frames, reference.region, chosen, reference_frame, coordinates, flow=flow
@@ -140,7 +126,6 @@ class _Training:
         alpha = self._phonemes(frames, "alpha", alphas)
         beta = self._phonemes(frames, "beta", betas)
         places = [frames.find(int(i)) for i in chosen]
-        calm = _calmest(used, rebased, reference)
         return Model(
             basis=basis,
             reference=reference,
@@ -149,7 +134,7 @@ class _Training:
             fps=used[0].info.fps,
             prototype_frames=np.stack([frame_at(c.path, f) for c, f in places]),
             sources=tuple((c.path.name, f) for c, f in places),
-            calm=Calm(np.fromfile(calm.path, np.uint8), calm.path.suffix, rebased[calm.path.name]),
+            calm=calmest(frames),
             notes=_notes(frames, skipped, self.options),
         )
 
@@ -166,34 +151,15 @@ class _Training:
 
     def _phonemes(self, frames: Frames, name: str, coordinates: list[Floats]) -> TrainedStream:
         """The phoneme models of one stream, from the frames whose head was found."""
-        utterances = []
-        for clip, z in zip(frames.clips, coordinates, strict=True):
-            good = np.flatnonzero(frames.tracks[clip.path.name].registered)
-            labels = clip.labels
-            utterances.append(Utterance(z[good].astype(np.float64), [labels[t] for t in good]))
+        utterances = utterances_of(frames, coordinates)
         rng = np.random.default_rng(self.options.seed)
         with progress_bar(None, f"train {name}") as advance:
             return fit_stream(utterances, rng=rng, progress=lambda done, total: advance(1))
 
 
-def _calmest(clips: Sequence[Clip], tracks: Mapping[str, Track], reference: Reference) -> Clip:
-    """The clip whose head stays nearest to the pose of the reference."""
-
-    def unrest(clip: Clip) -> float:
-        poses = tracks[clip.path.name].poses
-        return float(np.abs(poses[:, :2, 2] - poses[:, :2, 2].mean(axis=0)).mean())
-
-    return min(clips, key=unrest)
-
-
 def _notes(frames: Frames, skipped: Mapping[str, str], options: Options) -> dict[str, Any]:
-    tracks = frames.tracks.values()
     return {
-        "clips": [clip.path.name for clip in frames.clips],
-        "skipped": dict(skipped),
-        "frames": int(frames.registered.size),
-        "unregistered_frames": int((~frames.registered).sum()),
-        "registration_residual_px": float(np.mean([t.residual for t in tracks])),
+        **tracking_notes(frames, skipped),
         "seed": options.seed,
         "sync_s": options.sync,
         "flow": options.flow,

@@ -28,8 +28,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.errors import InputError
-from mmmgpu.phonemes import PhonemeModels, Utterance, pool, segment_starts
+from mmmgpu.phonemes import PhonemeModels, Utterance, cut_utterance, pool
 from mmmgpu.trajectories import (
     Timeline,
     error_and_gradient,
@@ -332,7 +331,7 @@ def _deal(
     """Pairs of clips to train on, without their offsets, and clips left out, as they are."""
     level, raw = remove_offsets(utterances), list(utterances)
     if len(raw) == 1:
-        level, raw = _cut(level[0], folds), _cut(raw[0], folds)
+        level, raw = cut_utterance(level[0], folds), cut_utterance(raw[0], folds)
     folds = min(folds, len(raw))
     fold = rng.permutation(len(raw)) % folds
     return [
@@ -342,25 +341,6 @@ def _deal(
         )
         for left_out in range(folds)
     ]
-
-
-def _cut(utterance: Utterance, pieces: int) -> list[Utterance]:
-    """At most `pieces` parts of about one length, cut between segments."""
-    starts = segment_starts(utterance.labels, utterance.segments)[1:].tolist()
-    n = len(utterance.z)
-    if not starts:
-        raise InputError(
-            "utterances: a single clip of a single segment cannot be divided into one part to "
-            "train on and one to judge by; give more speech"
-        )
-    wanted = [n * i / pieces for i in range(1, pieces)]
-    cuts = sorted({min(starts, key=lambda t: abs(t - w)) for w in wanted})
-    return [_frames(utterance, a, b) for a, b in zip([0, *cuts], [*cuts, n], strict=True)]
-
-
-def _frames(u: Utterance, start: int, end: int) -> Utterance:
-    segments = None if u.segments is None else u.segments[start:end]
-    return Utterance(u.z[start:end], u.labels[start:end], segments)
 
 
 def _split(train: Sequence[Utterance], left_out: Sequence[Utterance], order: int) -> _Split:

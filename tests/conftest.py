@@ -2,6 +2,7 @@ import signal
 
 import hypothesis
 import pytest
+from pairs import make_two_persons
 from worlds import make_postures, make_world
 
 from mmmgpu.backends import BACKENDS, get_backend
@@ -39,6 +40,12 @@ def backend(request):
 def world(tmp_path_factory):
     """A drawn person in a few short clips with sound and alignments; see `worlds`."""
     return make_world(tmp_path_factory.mktemp("world"))
+
+
+@pytest.fixture(scope="session")
+def two_persons(world, tmp_path_factory):
+    """The person of `world` with a model, and another one with two clips; see `pairs`."""
+    return make_two_persons(world, tmp_path_factory.mktemp("second"))
 
 
 @pytest.fixture(scope="session")

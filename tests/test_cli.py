@@ -19,7 +19,8 @@ from mmmgpu.training import Options
 from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
 
-COMMANDS = ("demo", "align", "train", "reconstruct", "speak", "evaluate", "info")
+COMMANDS = ("demo", "align", "train", "reconstruct", "speak", "evaluate")
+COMMANDS += ("mark", "transfer", "adapt", "info")
 SLOW = {"av", "cv2", "matplotlib", "numpy", "rich", "scipy", "sklearn", "warp"}
 
 

@@ -145,7 +145,7 @@ def test_errors_are_the_root_mean_squares(person, clips, result):
         speech = np.array([label != "SIL" for label in clip.labels])
         assert 0 < speech.sum() < len(speech)
         for kind in ("pooled", "trained"):
-            made = trajectories(person, clip.labels, trained=kind == "trained")
+            made = trajectories(person, clip.labels, kind=kind)
             real = analysed.alpha, analysed.beta
             for stream, y, z in zip(("alpha", "beta"), made, real, strict=True):
                 rms[stream, "all", kind].append(np.sqrt(((y - z) ** 2).sum() / y.size))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import oracles_model as oracles
 import pytest
@@ -31,14 +33,18 @@ def test_points_of_the_simplex_stay():
     assert project_on_simplex(np.zeros((0, 3))).shape == (0, 3)
 
 
-@pytest.mark.parametrize("trained", [True, False])
-def test_both_streams_follow_the_phones(model, trained):
+@pytest.mark.parametrize("kind", ["trained", "pooled", "other"])
+def test_both_streams_follow_the_phones(model, kind):
+    other = [m.mean + 0.1 for m in (model.alpha.trained, model.beta.trained)]
+    model = replace(model, alternatives={"other": tuple(other)})
     labels = ["SIL"] * 6 + ["AA"] * 5 + ["M"] * 4
-    alpha, beta = trajectories(model, labels, trained=trained)
+    alpha, beta = trajectories(model, labels, kind=kind)
     assert alpha.shape == (15, 4)
     assert beta.shape == (15, 5)
-    for got, stream in ((alpha, model.alpha), (beta, model.beta)):
-        models = stream.trained if trained else stream.pooled
+    for got, stream, mean in zip((alpha, beta), (model.alpha, model.beta), other, strict=True):
+        models = stream.pooled if kind == "pooled" else stream.trained
+        if kind == "other":
+            models = replace(models, mean=mean)
         wanted = synthesize_trajectory(
             models, labels, smoothness=stream.smoothness, order=stream.constants.order
         )
@@ -48,7 +54,7 @@ def test_both_streams_follow_the_phones(model, trained):
 def test_training_makes_a_difference(model):
     labels = ["SIL", "AA", "AA", "M", "SIL"]
     for trained, pooled in zip(
-        trajectories(model, labels), trajectories(model, labels, trained=False), strict=True
+        trajectories(model, labels), trajectories(model, labels, kind="pooled"), strict=True
     ):
         assert np.abs(trained - pooled).max() > 1e-3
 

@@ -2,7 +2,16 @@ import numpy as np
 import pytest
 
 from mmmgpu.errors import InputError
-from mmmgpu.phonemes import TINY_SHARE, PhonemeModels, Utterance, pool, segment_durations
+from mmmgpu.phonemes import (
+    TINY_SHARE,
+    PhonemeModels,
+    Utterance,
+    coverage,
+    cut_utterance,
+    pool,
+    segment_durations,
+)
+from mmmgpu.phones import CE05_CLASSES
 
 
 def utterance(rng, labels, n_dims=3):
@@ -97,3 +106,61 @@ def test_a_phone_without_frames_gets_the_streams_gaussian_if_asked_for():
     without = pool([clip])
     np.testing.assert_array_equal(models.mean[[0, 2]], without.mean)
     np.testing.assert_array_equal(models.variance[[0, 2]], without.variance)
+
+
+def test_precision_is_the_inverse_of_the_variances():
+    rng = np.random.default_rng(6)
+    variance = rng.uniform(0.1, 3, size=(2, 3))
+    models = PhonemeModels(("a", "b"), np.zeros((2, 3)), variance, np.array([3, 1]))
+    np.testing.assert_allclose(models.precision, 1 / variance, rtol=1e-15)
+    root = rng.normal(size=(2, 3, 3))
+    covariance = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    own = np.diagonal(covariance, axis1=1, axis2=2)
+    full = PhonemeModels(("a", "b"), np.zeros((2, 3)), own, np.array([3, 1]), covariance)
+    product = full.precision @ covariance
+    np.testing.assert_allclose(product, [np.eye(3)] * 2, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("labels", "segments", "want"),
+    [
+        ("abccccba", None, ["ab", "cccc", "ba"]),
+        ("abccbcba", None, ["ab", "ccb", "cba"]),
+        ("aaaaaaab", None, ["aaaaaaa", "b"]),
+        ("aaaaaaaa", [0, 0, 0, 1, 1, 1, 2, 2], ["aaa", "aaa", "aa"]),
+    ],
+)
+def test_an_utterance_is_cut_between_segments(labels, segments, want):
+    segments = None if segments is None else np.array(segments)
+    clip = Utterance(np.arange(8.0)[:, None], list(labels), segments)
+    parts = cut_utterance(clip, 3)
+    assert ["".join(part.labels) for part in parts] == want
+    np.testing.assert_array_equal(np.concatenate([part.z for part in parts]), clip.z)
+    if segments is not None:
+        np.testing.assert_array_equal(np.concatenate([part.segments for part in parts]), segments)
+
+
+def test_one_segment_cannot_be_cut():
+    with pytest.raises(InputError, match=r"single segment cannot be divided.*give more speech"):
+        cut_utterance(Utterance(np.zeros((5, 1)), ["SIL"] * 5), 3)
+
+
+def test_coverage_counts_as_the_paper_does():
+    phones = [phone for phones in CE05_CLASSES for phone in phones]
+    seen = [phone for phone in phones if phone != "SIL"][:18]
+    labels = ["SIL"] * 299 + [seen[i % 18] for i in range(151)]
+    found = coverage(labels, phones)
+    assert round(found.per_phone, 2) == 11.25
+    assert round(found.per_phone_without_silence, 2) == 3.87
+    assert len(found.unseen) == 21
+    assert set(found.unseen) == set(phones) - set(seen) - {"SIL"}
+    assert found.frames["SIL"] == 299
+    assert sum(found.frames.values()) == 450
+    assert found.others == {}
+
+
+def test_coverage_keeps_phones_of_other_inventories_apart():
+    found = coverage(["AY", "B", "AY", "SIL"], ["SIL", "B"])
+    assert found.others == {"AY": 2}
+    assert found.frames == {"SIL": 1, "B": 1}
+    assert found.per_phone == 1

@@ -1,7 +1,9 @@
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from oracles_adaptation import dense_follow
 from oracles_trajectories import dense_difference, dense_error, dense_trajectory
 
 from mmmgpu.errors import InputError
@@ -9,6 +11,7 @@ from mmmgpu.phonemes import PhonemeModels, Utterance, pool
 from mmmgpu.trajectories import (
     difference_band,
     error_and_gradient,
+    factor_system,
     lay_out_utterances,
     scaled_smoothness,
     synthesize_trajectory,
@@ -21,6 +24,24 @@ def random_models(rng, labels="abcd", n_dims=3):
         rng.normal(size=(len(labels), n_dims)),
         rng.uniform(0.1, 3, size=(len(labels), n_dims)),
         rng.integers(1, 9, size=len(labels)),
+    )
+
+
+def full_models(rng, labels="abcd", n_dims=3):
+    root = rng.normal(size=(len(labels), n_dims, n_dims))
+    covariance = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(n_dims)
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    return replace(random_models(rng, labels, n_dims), variance=variance, covariance=covariance)
+
+
+def by_label(models):
+    """Means and full covariances as the dense oracles want them."""
+    covariance = models.covariance
+    if covariance is None:
+        covariance = [np.diag(own) for own in models.variance]
+    return (
+        dict(zip(models.labels, models.mean, strict=True)),
+        dict(zip(models.labels, covariance, strict=True)),
     )
 
 
@@ -152,3 +173,55 @@ def test_bad_arguments_are_named(options, message):
     models = random_models(np.random.default_rng(6))
     with pytest.raises(InputError, match=message):
         synthesize_trajectory(models, list("aab"), **options)
+
+
+KINDS = pytest.mark.parametrize("make_models", [random_models, full_models])
+
+
+@KINDS
+@pytest.mark.parametrize("order", [1, 2, 4])
+@pytest.mark.parametrize("labels", ["a", "ab", "aaaa", "aabbc", "abbcccddddab", "aaabbbdd" * 5])
+def test_all_dimensions_together_solve_equation_3(labels, order, make_models):
+    models = make_models(np.random.default_rng(7))
+    smoothness = np.array([0.0, 1.0, 50.0])
+    y = synthesize_trajectory(models, list(labels), smoothness=smoothness, order=order)
+    want = dense_follow(labels, runs(labels), *by_label(models), smoothness, order)
+    np.testing.assert_allclose(y, want, rtol=1e-9, atol=1e-11)
+
+
+def test_full_covariances_couple_dimensions_and_diagonal_ones_do_not():
+    rng = np.random.default_rng(8)
+    full = full_models(rng)
+    labels = list("aabbbccd")
+    apart = [np.diag(own) for own in full.variance]
+    diagonal = replace(full, covariance=None)
+    y = synthesize_trajectory(diagonal, labels, smoothness=2.0)
+    same = synthesize_trajectory(replace(full, covariance=np.array(apart)), labels, smoothness=2.0)
+    np.testing.assert_allclose(same, y, rtol=1e-10)
+    assert abs(synthesize_trajectory(full, labels, smoothness=2.0) - y).max() > 1e-2
+
+
+@KINDS
+def test_slope_of_the_system_is_that_of_the_dense_error(make_models):
+    rng = np.random.default_rng(9)
+    models = make_models(rng)
+    texts = ["aabbbccd", "ddb", "a", "cccaaabbb"]
+    clips = [Utterance(rng.normal(size=(len(text), 3)), list(text)) for text in texts]
+    z = np.concatenate([u.z for u in clips])
+    smoothness = np.array([0.5, 1.0, 3.0])
+    system = factor_system(lay_out_utterances(models, clips), models, smoothness)
+    error, slope = system.error_and_slope(models.mean, z)
+
+    def dense(mean):
+        gaussians = by_label(replace(models, mean=mean))
+        return sum(
+            np.sum((u.z - dense_follow(u.labels, runs(u.labels), *gaussians, smoothness, 4)) ** 2)
+            for u in clips
+        )
+
+    np.testing.assert_allclose(error, dense(models.mean), rtol=1e-10)
+    for p, j in np.ndindex(models.mean.shape):
+        e = np.zeros_like(models.mean)
+        e[p, j] = 1e-4
+        central = (dense(models.mean + e) - dense(models.mean - e)) / 2e-4
+        np.testing.assert_allclose(slope[p, j], central, rtol=1e-5, atol=1e-8)

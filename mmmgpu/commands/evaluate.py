@@ -1,5 +1,9 @@
 """``mmmgpu evaluate``: synthesis from phones against real clips."""
 
+from typing import Annotated
+
+import typer
+
 from mmmgpu.commands.options import (
     Alignments,
     Backend,
@@ -23,6 +27,10 @@ def evaluate(
     alignments: Alignments,
     landmarks: Landmarks = None,
     sync: Sync,
+    pictures: Annotated[
+        bool,
+        typer.Option("--pictures", help="Also render every frame and compare it."),
+    ] = False,
     backend: Backend,
     report: Report = None,
     json: Json = None,
@@ -43,7 +51,15 @@ def evaluate(
 
     get_backend(backend)
     person = load(model)
-    results = judge(person, found, alignments, sync=sync, landmarks=landmarks, backend=backend)
+    results = judge(
+        person,
+        found,
+        alignments,
+        sync=sync,
+        landmarks=landmarks,
+        pictures=pictures,
+        backend=backend,
+    )
     show_table(f"{model} on {len(found)} clips", flat(results))
     write_results(results, json)
     if report is not None:

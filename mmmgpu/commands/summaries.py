@@ -101,6 +101,7 @@ def _said(value: Any) -> str:
         return f"{len(value)}: {value[0]} ... {value[-1]}"
     if isinstance(value, list):
         return ", ".join(map(str, value)) or "none"
-    if isinstance(value, dict):
-        return "; ".join(f"{name}: {what}" for name, what in value.items()) or "none"
+    if isinstance(value, dict):  # tables in it are for reports and --json
+        plain = {name: what for name, what in value.items() if not isinstance(what, dict | list)}
+        return "; ".join(f"{name}: {_said(what)}" for name, what in plain.items()) or "none"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,341 @@
+"""Adaptation: a transferred model takes on the new person's speaking style (CE05, section 5).
+
+The prototypes that resemble A's are not those that show B's clips best: others are chosen from
+B's clips, and the phoneme models are carried into their coordinates (Eq. 11-13, `reselection`).
+Then the means are adapted to B's own trajectories, class by class (Eq. 14-17, `adaptation_folds`).
+"""
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.adaptation_folds import METHODS, Adapted, adapt_models
+from mmmgpu.analysis import analyze, prepare_analysis
+from mmmgpu.backends import get_backend
+from mmmgpu.basis import Basis
+from mmmgpu.corpora import Clip, check_rates, open_corpus
+from mmmgpu.corpus_steps import (
+    Frames,
+    Thumbnails,
+    analyse_corpus,
+    calmest,
+    rebased_frames,
+    track_corpus,
+    tracking_notes,
+    utterances_of,
+    work_folder,
+)
+from mmmgpu.errors import InputError
+from mmmgpu.flows import MATCHERS
+from mmmgpu.gdlr import RULES, Descent
+from mmmgpu.models import Model
+from mmmgpu.parallel import one_thread_each
+from mmmgpu.phonemes import PhonemeModels, Utterance, coverage
+from mmmgpu.phones import CE05_PHONES, SIL, ce05_phone
+from mmmgpu.progress import progress_bar
+from mmmgpu.prototype_flows import prototype_basis
+from mmmgpu.prototypes import choose_prototypes, principal_coordinates
+from mmmgpu.regression_classes import Classes, kmeans_classes, paper_classes
+from mmmgpu.reselection import COVARIANCES, carry
+from mmmgpu.tracks import frame_at
+from mmmgpu.trajectories import scaled_smoothness
+from mmmgpu.trajectory_training import History, TrainedStream
+
+F32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+CLASSES = ("kmeans", "paper")
+CLASS_COUNTS = (1, 3, 9)  # of k-means: which, is chosen by folds
+WITH_CLASSES = ("shift", "mllr", "gdlr")
+LEAST_S = 1.0  # of speech and silence together
+
+
+@dataclass(frozen=True)
+class AdaptOptions:
+    """What a person may choose about adaptation.
+
+    method: one of `adaptation_folds.METHODS`; the others are kept in the model for comparison.
+    classes: one of `CLASSES`: k-means on the phoneme means, into as many as the folds like best, or
+        the paper's nine.
+    covariance: one of `reselection.COVARIANCES`, of the phoneme models after Eq. 13.
+    step: one of `gdlr.RULES`.
+    sync: [s] by which sound and alignments are moved against the picture; negative: earlier.
+    flow: one of `flows.MATCHERS`.
+    seed: of k-means and of the folds.
+    """
+
+    method: str = "gdlr"
+    classes: str = "kmeans"
+    covariance: str = "diagonal"
+    step: str = "bounded"
+    sync: float = 0.0
+    flow: str = "dis"
+    seed: int = 0
+
+
+DEFAULTS = AdaptOptions()
+
+
+def adapt(
+    model: Model,
+    clips: Sequence[str | os.PathLike[str]],
+    alignments: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    options: AdaptOptions = DEFAULTS,
+    backend: str = "warp",
+) -> Model:
+    """Adapt `model`, which has the face of the person in `clips`, to how that person speaks.
+
+    Args:
+        model: A transferred model.
+        clips: Video files of its person, the one with the model's reference frame among them.
+        alignments: Folder of TextGrid, .align or .lab files named like the clips, or one file.
+        out: The model file; beside it ``out.work`` keeps finished steps until the job is done, and
+            the same call continues after them.
+        options: See `AdaptOptions`.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The adapted model. Its pooled phoneme models are those before adaptation, its trained ones
+        those after; `alternatives` are the means by the other methods.
+
+    Raises:
+        InputError: A clip or alignment cannot be used; too little is said; the model has no
+            phoneme models; an option is unknown.
+    """
+    _check_options(options)
+    out = Path(out)
+    corpus = open_corpus([Path(c) for c in clips], Path(alignments), sync=options.sync)
+    check_rates(corpus)
+    _check_corpus(model, corpus)
+    given = {
+        "options": vars(options),
+        "reference": list(model.sources[model.basis.reference]),
+        "box": list(model.basis.region.box),
+        "adapt": 1,
+    }
+    folder = work_folder(out, corpus, given)
+    with one_thread_each():
+        adapted = _Adaptation(model, corpus, options, backend, folder).run()
+    adapted.save(out)
+    shutil.rmtree(folder)
+    return adapted
+
+
+def _check_options(options: AdaptOptions) -> None:
+    choices = {
+        "method": METHODS,
+        "classes": CLASSES,
+        "covariance": COVARIANCES,
+        "step": tuple(RULES),
+        "flow": MATCHERS,
+    }
+    for name, known in choices.items():
+        given = getattr(options, name)
+        if given not in known:
+            raise InputError(f"{name}: must be one of {', '.join(known)}, got {given!r}")
+
+
+def _check_corpus(model: Model, corpus: Sequence[Clip]) -> None:
+    """There is enough to learn from, in the model's frame rate and with its reference frame."""
+    if not model.alpha.trained.labels:
+        raise InputError("the source model has no phoneme models; transfer from a trained model")
+    rate, first = model.fps, corpus[0]
+    if abs(first.info.fps / rate - 1) > 0.001:
+        raise InputError(
+            f"{first.path}: has {float(first.info.fps):g} frames/s, the model {float(rate):g}; "
+            "convert the clips"
+        )
+    name, t = model.sources[model.basis.reference]
+    if name not in [clip.path.name for clip in corpus]:
+        raise InputError(f"{name}: holds the model's reference frame {t}; give this clip too")
+    length = sum(float(clip.info.duration) for clip in corpus)
+    if length < LEAST_S:
+        raise InputError(
+            f"{first.path}: {length:.2f} s are too short to adapt to; give {LEAST_S:g} s or more"
+        )
+    spoken = {label for clip in corpus for label in clip.labels} - {SIL}
+    if len(spoken) < 2:
+        what = f"only the phone {spoken.pop()}" if spoken else "no speech"
+        raise InputError(f"{first.path}: the clips hold {what}; give clips with several phones")
+
+
+@dataclass(frozen=True)
+class _Adaptation:
+    """One run; every method is a step."""
+
+    model: Model
+    corpus: list[Clip]
+    options: AdaptOptions
+    backend: str
+    folder: Path
+
+    def run(self) -> Model:
+        model, options = self.model, self.options
+        tracks, skipped = track_corpus(self.folder, self.corpus, model.reference)
+        frames = rebased_frames(self.corpus, tracks, *model.sources[model.basis.reference])
+        chosen, basis = self._reselect(frames)
+        to_new = self._old_in_new(basis)
+        before = tuple(
+            carry(stream.trained, matrix, covariance=options.covariance)
+            for stream, matrix in zip((model.alpha, model.beta), to_new, strict=True)
+        )
+        partitions = self._partitions(before)
+        analysed = analyse_corpus(
+            self.folder, frames, basis, flow=options.flow, backend=self.backend
+        )
+        streams, others = [], []
+        curves: dict[str, Any] = {}
+        classes: dict[str, Classes] = {}
+        for name, old, carried, z in zip(
+            ("alpha", "beta"), (model.alpha, model.beta), before, analysed, strict=True
+        ):
+            smoothness = scaled_smoothness(carried, old.constants.smoothness)
+            start = replace(old, pooled=carried, trained=carried, smoothness=smoothness)
+            results = self._adapt(name, start, utterances_of(frames, z), partitions)
+            best, classes[name] = results[options.method]
+            streams.append(_adapted_stream(start, best))
+            others.append({m: r.models.mean for m, (r, _) in results.items()})
+            curves[name] = {m: _curve(r) | {"classes": len(c)} for m, (r, c) in results.items()}
+        places = [frames.find(int(i)) for i in chosen]
+        return Model(
+            basis=basis,
+            reference=model.reference,
+            alpha=streams[0],
+            beta=streams[1],
+            fps=model.fps,
+            prototype_frames=np.stack([frame_at(c.path, t) for c, t in places]),
+            sources=tuple((c.path.name, t) for c, t in places),
+            calm=calmest(frames),
+            notes=self._notes(frames, skipped, classes, curves),
+            alternatives={
+                m: (others[0][m], others[1][m])
+                for m in METHODS
+                if m not in ("none", options.method)
+            },
+        )
+
+    def _reselect(self, frames: Frames) -> tuple[NDArray[np.int64], Basis]:
+        """New prototypes from these clips, the reference frame among them, and their basis."""
+        coordinates = principal_coordinates(Thumbnails(self.folder, frames.clips))
+        usable = np.flatnonzero(frames.registered)
+        count = min(len(self.model.sources), len(usable))
+        chosen = usable[choose_prototypes(coordinates[usable], count, seed=self.options.seed)]
+        origin = frames.number(*self.model.sources[self.model.basis.reference])
+        if origin not in chosen:
+            near = ((coordinates[chosen] - coordinates[origin]) ** 2).sum(axis=1).argmin()
+            chosen = np.sort(np.append(np.delete(chosen, near), origin))
+        region = self.model.basis.region
+        basis = prototype_basis(frames, region, chosen, origin, coordinates, flow=self.options.flow)
+        return chosen, replace(basis, w_f=self.model.basis.w_f, w_t=self.model.basis.w_t)
+
+    def _old_in_new(self, basis: Basis) -> tuple[Floats, Floats]:
+        """Eq. 11-12: A (M' - 1, M - 1) and B (M', M); column k is old prototype k in the new."""
+        old, analyzer = self.model.basis, prepare_analysis(basis, flow=self.options.flow)
+        kernels = get_backend(self.backend, 1)
+        found = [analyze(analyzer, image, kernels) for image in old.images]
+        alpha = np.stack([a for a, _ in found], axis=1)[:, old.moving]
+        return alpha, np.stack([b for _, b in found], axis=1)
+
+    def _partitions(self, before: Sequence[PhonemeModels]) -> list[Classes]:
+        """The ways to group phones that are tried: little data wants few classes."""
+        if self.options.classes == "paper":
+            return [paper_classes(before[0].labels)]
+        seed = self.options.seed
+        return [kmeans_classes(*before, count=count, seed=seed) for count in CLASS_COUNTS]
+
+    def _adapt(
+        self,
+        name: str,
+        start: TrainedStream,
+        utterances: Sequence[Utterance],
+        partitions: Sequence[Classes],
+    ) -> dict[str, tuple[Adapted, Classes]]:
+        """One stream by every method, each with the classes that suit it best by its folds."""
+        results = {}
+        with progress_bar(None, f"adapt {name}") as advance:
+            for method in METHODS:
+                tried = [
+                    adapt_models(
+                        start.pooled,
+                        utterances,
+                        smoothness=start.smoothness,
+                        order=start.constants.order,
+                        method=method,
+                        classes=classes,
+                        rng=np.random.default_rng(self.options.seed),
+                        descent=Descent(rule=self.options.step),
+                        progress=lambda done, total: advance(1),
+                    )
+                    for classes in (partitions if method in WITH_CLASSES else partitions[:1])
+                ]
+                best = int(np.argmin([found.validation.min() for found in tried]))
+                results[method] = tried[best], partitions[best]
+        return results
+
+    def _notes(
+        self,
+        frames: Frames,
+        skipped: Mapping[str, str],
+        classes: Mapping[str, Classes],
+        curves: Mapping[str, Any],
+    ) -> dict[str, Any]:
+        kept = ("transferred_from", "matching")
+        return {
+            **tracking_notes(frames, skipped),
+            "sync_s": self.options.sync,
+            "flow": self.options.flow,
+            "seed": self.options.seed,
+            **{key: self.model.notes[key] for key in kept if key in self.model.notes},
+            "adaptation": {
+                "method": self.options.method,
+                "covariance": self.options.covariance,
+                "step": self.options.step,
+                "classes": {name: [list(g) for g in groups] for name, groups in classes.items()},
+                "coverage": _coverage(frames),
+                "curves": dict(curves),
+            },
+        }
+
+
+def _coverage(frames: Frames) -> dict[str, Any]:
+    """Frames a phone with and without silence and the phones not seen, of the paper's 40."""
+    said = [ce05_phone(label) for clip in frames.clips for label in clip.labels]
+    found = coverage(said, CE05_PHONES)
+    return {
+        "frames": found.frames,
+        "frames_per_phone": found.per_phone,
+        "frames_per_phone_without_silence": found.per_phone_without_silence,
+        "phones_not_seen": list(found.unseen),
+    }
+
+
+def _adapted_stream(start: TrainedStream, best: Adapted) -> TrainedStream:
+    dimensions = len(start.smoothness)
+    return replace(
+        start,
+        trained=best.models,
+        history=History(np.empty((0, dimensions))),
+        validation=best.validation,
+    )
+
+
+def _curve(result: Adapted) -> dict[str, Any]:
+    """What was tried and how well it did: mean squared errors of the clips used and left out.
+
+    "path": which candidates are the iterations of GDLR at the chosen rate, in order.
+    """
+    return {
+        "chosen": result.constants,
+        "candidates": list(result.candidates),
+        "path": result.path.tolist(),
+        "training": [float(e) for e in result.training],
+        "validation": [float(e) for e in result.validation],
+    }

@@ -1,0 +1,358 @@
+"""Transfer: a model learned from one person's long video, with the pictures of another (CE05, 4).
+
+A is the person with a model, B the new one. B's clips are tracked from the closed reference frame
+that POINTS names, the flows of all of B's frames are taken relative to B's reference frames, and
+every prototype of A is replaced by the frame of B that shows the same (`matching`). Phoneme models
+stay A's: B speaks in A's style until `adaptation`.
+"""
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.basis import Basis, make_basis
+from mmmgpu.checkpoints import write_step
+from mmmgpu.corpora import Clip, open_corpus
+from mmmgpu.corpus_steps import (
+    Frames,
+    calmest,
+    finished_step,
+    for_all,
+    rebased_frames,
+    track_corpus,
+    tracking_notes,
+    work_folder,
+)
+from mmmgpu.correspondence import Correspondence, rbf_correspondence
+from mmmgpu.errors import InputError
+from mmmgpu.flows import best_flow, matcher
+from mmmgpu.matching import BALANCE, MOUTH, Matching, View, match_prototypes
+from mmmgpu.models import Model
+from mmmgpu.parallel import one_thread_each
+from mmmgpu.points import PointPair, check_frames, read_points
+from mmmgpu.processes import Tick, Work
+from mmmgpu.reference_pairs import CLOSED, pose_of
+from mmmgpu.regions import Region, mouth_mask, region_around
+from mmmgpu.registration import head_from_frame, project
+from mmmgpu.tracks import Reference, Track, crop, crops, frame_at, make_reference
+
+F32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TransferOptions:
+    """What a person may choose about transfer.
+
+    balance: t of the paper, in [0, 1]: 1 matches by flow alone, 0 by texture alone.
+    sync: [s] by which sound and alignments are moved against the picture; negative: earlier.
+    flow: one of `flows.MATCHERS`.
+    """
+
+    balance: float = BALANCE
+    sync: float = 0.0
+    flow: str = "dis"
+
+
+DEFAULTS = TransferOptions()
+
+
+def transfer(
+    source: Model,
+    clips: Sequence[str | os.PathLike[str]],
+    alignments: str | os.PathLike[str],
+    points: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    options: TransferOptions = DEFAULTS,
+    backend: str = "warp",
+) -> Model:
+    """Give `source` the face of the person in `clips`, and write the new model to `out`.
+
+    Args:
+        source: A's model.
+        clips: Video files of B; 15 seconds will do.
+        alignments: Folder of TextGrid, .align or .lab files named like the clips, or one file.
+        points: File of corresponding points (`mmmgpu mark`) in the closed and, if there are any,
+            open reference frames of both.
+        out: The model file; beside it ``out.work`` keeps finished steps until the job is done, and
+            the same call continues after them.
+        options: See `TransferOptions`.
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Raises:
+        InputError: A clip, alignment or the points cannot be used; the points are of other frames;
+            B's head is found in no clip.
+    """
+    if not 0 <= options.balance <= 1:
+        raise InputError(f"balance must be between 0 and 1, got {options.balance}")
+    out = Path(out)
+    corpus = open_corpus([Path(c) for c in clips], Path(alignments), sync=options.sync)
+    marked = _marked_frames(source, corpus, Path(points))
+    given = {
+        "options": vars(options),
+        "points": [vars(m.pair.b) | {"at": m.pair.points_b.tolist()} for m in marked.values()],
+        "from": [m.pair.points_a.tolist() for m in marked.values()],
+        "sources": [list(place) for place in source.sources],
+        "transfer": 1,
+    }
+    folder = work_folder(out, corpus, given)
+    with one_thread_each():
+        model = _Transfer(source, corpus, marked, options, backend, folder).run()
+    model.save(out)
+    shutil.rmtree(folder)
+    return model
+
+
+@dataclass(frozen=True)
+class _Marked:
+    """A pair of reference frames with the points in them.
+
+    prototype: A's frame is that of this prototype. picture: B's frame, (H, W, 3).
+    """
+
+    pair: PointPair
+    prototype: int
+    picture: NDArray[np.uint8]
+
+
+def _marked_frames(source: Model, corpus: Sequence[Clip], path: Path) -> dict[str, _Marked]:
+    """The frames that the points at `path` are of, by kind."""
+    marked = {}
+    by_name = {clip.path.name: clip for clip in corpus}
+    for pair in read_points(path):
+        where = f"{path}: {pair.kind} pair"
+        place = (pair.a.clip, pair.a.frame)
+        if place not in source.sources:
+            raise InputError(
+                f"{where}: frame {pair.a.frame} of {pair.a.clip} is no prototype of the model; "
+                "mark the points again with this model"
+            )
+        k = source.sources.index(place)
+        if pair.kind == CLOSED and k != source.basis.reference:
+            raise InputError(
+                f"{where}: frame {pair.a.frame} of {pair.a.clip} is not the reference of the "
+                "model; mark the points again with this model"
+            )
+        clip = by_name.get(pair.b.clip)
+        if clip is None or not 0 <= pair.b.frame < clip.info.frames:
+            raise InputError(
+                f"{where}: frame {pair.b.frame} of {pair.b.clip} is not among the clips; give "
+                "the clip too, or mark the points again"
+            )
+        marked[pair.kind] = _Marked(pair, k, frame_at(clip.path, pair.b.frame))
+    shown = {kind: (source.prototype_frames[m.prototype], m.picture) for kind, m in marked.items()}
+    check_frames([m.pair for m in marked.values()], shown, path)
+    return marked
+
+
+@dataclass(frozen=True)
+class _Transfer:
+    """One run; every method is a step."""
+
+    source: Model
+    corpus: list[Clip]
+    marked: Mapping[str, _Marked]
+    options: TransferOptions
+    backend: str
+    folder: Path
+
+    def run(self) -> Model:
+        reference, old = self._reference(), self.source.basis
+        frames, skipped = self._track(reference)
+        region, usable = reference.region, np.flatnonzero(frames.registered)
+        maps = self._correspondences(frames, region)
+        w_f, w_t = (carried_mask(m, maps[CLOSED], region.shape) for m in (old.w_f, old.w_t))
+        images = _good(frames, lambda clip, track: np.stack(list(crops(clip.path, track, region))))
+        flows = self._flows(frames, region)
+        views = [
+            View(self.marked[kind].prototype, maps[kind], self._source_flows(kind), flow)
+            for kind, flow in flows.items()
+        ]
+        closed = int(np.searchsorted(usable, self._number(frames, CLOSED)))
+        matching = match_prototypes(
+            old,
+            Basis(images, flows[CLOSED], 0, region, w_f, w_t, w_t),
+            views,
+            fixed=[(old.reference, closed)],
+            balance=self.options.balance,
+            backend=self.backend,
+        )
+        chosen = matching.chosen
+        basis = make_basis(images[chosen], flows[CLOSED][chosen], old.reference, region)
+        places = [frames.find(int(i)) for i in usable[chosen]]
+        return replace(
+            self.source,
+            basis=replace(basis, w_f=w_f, w_t=w_t),
+            reference=reference,
+            prototype_frames=np.stack([frame_at(c.path, t) for c, t in places]),
+            sources=tuple((c.path.name, t) for c, t in places),
+            calm=calmest(frames),
+            notes=self._notes(frames, skipped, matching, maps),
+        )
+
+    def _reference(self) -> Reference:
+        """B's closed frame, with A's mouth carried to where it is in it."""
+        closed = self.marked[CLOSED]
+        s = rbf_correspondence(closed.pair.points_a, closed.pair.points_b)
+        x, y, width = self.source.reference.region.mouth
+        middle, left, right = s([[x, y], [x - width / 2, y], [x + width / 2, y]])
+        mouth = np.array([*middle, np.hypot(*(right - left))])
+        height, across = closed.picture.shape[:2]
+        region = region_around(mouth.tolist(), (across, height))
+        return make_reference(closed.picture, head_from_frame(closed.picture, mouth), region)
+
+    def _track(self, reference: Reference) -> tuple[Frames, dict[str, str]]:
+        """B's frames as the closed reference frame sees them: its own pose is the identity."""
+        tracks, skipped = track_corpus(self.folder, self.corpus, reference)
+        for kind, marked in self.marked.items():
+            if marked.pair.b.clip not in tracks:
+                raise InputError(
+                    f"{marked.pair.b.clip}: holds the {kind} reference frame, but its head was "
+                    "not found in the clip; mark another frame"
+                )
+        at = self.marked[CLOSED].pair.b
+        return rebased_frames(self.corpus, tracks, at.clip, at.frame), skipped
+
+    def _number(self, frames: Frames, kind: str) -> int:
+        at = self.marked[kind].pair.b
+        return frames.number(at.clip, at.frame)
+
+    def _correspondences(self, frames: Frames, region: Region) -> dict[str, Correspondence]:
+        """S of each pair, from the pixels of A's stabilised region to those of B's."""
+        origin_a = np.array(self.source.basis.region.box[:2])
+        origin_b = np.array(region.box[:2])
+        maps = {}
+        for kind, marked in self.marked.items():
+            picture = self.source.prototype_frames[marked.prototype]
+            pose_a = np.eye(3)
+            if kind != CLOSED:
+                pose_a = pose_of(picture, self.source.reference, f"the model's {kind} frame")
+            pose_b = frames.tracks[marked.pair.b.clip].poses[marked.pair.b.frame]
+            a = _carried_back(pose_a, marked.pair.points_a) - origin_a
+            b = _carried_back(pose_b, marked.pair.points_b) - origin_b
+            maps[kind] = rbf_correspondence(a, b)
+            if self._folded(maps[kind]):
+                print(
+                    f"warning: the {kind} points fold {100 * self._folded(maps[kind]):.1f} % of "
+                    "the mouth over; look for crossed points with: mmmgpu mark",
+                    file=sys.stderr,
+                )
+        return maps
+
+    def _folded(self, s: Correspondence) -> float:
+        """Share of A's mouth that `s` folds over."""
+        mouth = self.source.basis.w_t > MOUTH
+        return float(s.folds(*mouth.shape[::-1])[mouth].mean())
+
+    def _source_flows(self, kind: str) -> F32:
+        """Flows of A's prototypes from the reference frame of `kind`, (M, h, w, 2)."""
+        basis, match = self.source.basis, matcher(self.options.flow)
+        if kind == CLOSED:
+            return basis.flows
+        origin = basis.images[self.marked[kind].prototype]
+        closed = basis.images[basis.reference]
+        via = [(closed, match(origin, closed))]
+        still = np.minimum(1, 2 * basis.cover)[..., None]
+        flows = [best_flow(origin, image, basis.w_t, via, match) for image in basis.images]
+        return np.stack(flows) * still
+
+    def _flows(self, frames: Frames, region: Region) -> dict[str, F32]:
+        """Flows of B's usable frames from each of its reference frames, (N, h', w', 2)."""
+        pictures = {}
+        for kind, marked in self.marked.items():
+            track = frames.tracks[marked.pair.b.clip]
+            pictures[kind] = crop(marked.picture, track.poses[marked.pair.b.frame], track, region)
+        shared = (self.folder, region, pictures, self.options.flow)
+        items = [(clip, frames.tracks[clip.path.name]) for clip in frames.clips]
+        for_all(self.folder, _flowing, shared, "flow", "flows of frames", items)
+        flows = {}
+        for kind in self.marked:
+
+            def of_kind(clip: Clip, _: Track, kind: str = kind) -> NDArray[Any]:
+                return finished_step(self.folder, "flow", clip.path.name)[kind]
+
+            flows[kind] = _good(frames, of_kind)
+        return flows
+
+    def _notes(
+        self,
+        frames: Frames,
+        skipped: Mapping[str, str],
+        matching: Matching,
+        maps: Mapping[str, Correspondence],
+    ) -> dict[str, Any]:
+        kinds = list(self.marked)
+        return {
+            **tracking_notes(frames, skipped),
+            "sync_s": self.options.sync,
+            "flow": self.options.flow,
+            "transferred_from": {
+                "clips": self.source.notes.get("clips", []),
+                "prototypes": [list(place) for place in self.source.sources],
+            },
+            "matching": {
+                "balance": self.options.balance,
+                "outcome": matching.outcome,
+                "iterations": len(matching.history) - 1,
+                "history": matching.history.tolist(),
+                "flow_distance": np.round(matching.flow_distance, 6).tolist(),
+                "texture_distance": np.round(matching.texture_distance, 6).tolist(),
+                "reference": [kinds[v] for v in matching.view],
+                "different_frames": len(set(matching.chosen.tolist())),
+                "folded_share": {kind: self._folded(s) for kind, s in maps.items()},
+            },
+        }
+
+
+def _carried_back(pose: Floats, points: Floats) -> Floats:
+    """Points of a frame, (n, 2) [px], where the reference sees them."""
+    return project(np.asarray(np.linalg.inv(pose), np.float64), points)
+
+
+def carried_mask(mask: F32, s: Correspondence, shape: tuple[int, int]) -> F32:
+    """A's `mask` (h, w) on B's pixels, (h', w') = `shape`: read at the inverse of S."""
+    q = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
+    p = s.inverse(q).astype(np.float32)
+    return np.asarray(cv2.remap(mask, p[..., 0], p[..., 1], cv2.INTER_LINEAR), np.float32)
+
+
+def _good(frames: Frames, read: Callable[[Clip, Track], NDArray[Any]]) -> F32:
+    """What `read` gives for the frames of every clip, only those whose head was found."""
+    parts = []
+    for clip in frames.clips:
+        track = frames.tracks[clip.path.name]
+        parts.append(read(clip, track)[track.registered])
+    return np.concatenate(parts)
+
+
+def _flowing(shared: tuple[Path, Region, Mapping[str, F32], str]) -> Work:
+    """Keeps the flows of every frame of a clip, from each reference: direct, or by another."""
+    folder, region, origins, flow = shared
+    match = matcher(flow)
+    mask = mouth_mask(region)
+    between = {
+        kind: [
+            (origins[other], match(origin, origins[other])) for other in origins if other != kind
+        ]
+        for kind, origin in origins.items()
+    }
+
+    def work(item: tuple[Clip, Track], tick: Tick) -> None:
+        clip, track = item
+        flows: dict[str, list[F32]] = {kind: [] for kind in origins}
+        for image in crops(clip.path, track, region):
+            for kind, origin in origins.items():
+                flows[kind].append(best_flow(origin, image, mask, between[kind], match))
+            tick()
+        write_step(folder, f"flow-{clip.path.name}", {k: np.stack(f) for k, f in flows.items()})
+
+    return work

@@ -1,0 +1,277 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from oracles_adaptation import dense_follow, regression_slope
+
+from mmmgpu.errors import InputError
+from mmmgpu.gdlr import (
+    RATES,
+    RULES,
+    Descent,
+    class_curvature,
+    descend_means,
+    error_and_slope,
+    gain,
+    identity_regressions,
+    regressed,
+)
+from mmmgpu.phonemes import PhonemeModels, Utterance
+from mmmgpu.trajectories import factor_system, lay_out_utterances
+
+CLASS_OF = np.array([0, 1, 0, 1])  # of the phones a, b, c, d
+SMOOTHNESS = np.array([0.5, 3.0])
+DENSE = ["diagonal", "full"]
+
+
+def random_models(rng, kind="diagonal", n_dims=2):
+    variance = rng.uniform(0.2, 2, size=(4, n_dims))
+    covariance = None
+    if kind == "full":
+        root = rng.normal(size=(4, n_dims, n_dims))
+        covariance = root @ root.transpose(0, 2, 1) + 0.2 * np.eye(n_dims)
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+    mean = rng.normal(size=(4, n_dims))
+    return PhonemeModels(tuple("abcd"), mean, variance, np.ones(4, int), covariance)
+
+
+def corpus(rng, texts=("aabbcccd", "dda"), n_dims=2):
+    return [Utterance(rng.normal(size=(len(text), n_dims)), list(text)) for text in texts]
+
+
+def system_of(models, clips, smoothness=SMOOTHNESS):
+    system = factor_system(lay_out_utterances(models, clips), models, smoothness)
+    return system, np.concatenate([u.z for u in clips])
+
+
+def dense_arguments(models, clips):
+    covariance = models.covariance
+    if covariance is None:
+        covariance = [np.diag(own) for own in models.variance]
+    runs = [np.cumsum([0, *(a != b for a, b in pairwise(u.labels))]) for u in clips]
+    return (
+        [(u.z, u.labels, own) for u, own in zip(clips, runs, strict=True)],
+        dict(zip(models.labels, models.mean, strict=True)),
+        dict(zip(models.labels, covariance, strict=True)),
+    )
+
+
+def descend(system, mean, z, rule="bounded", *, rate=1.0, iterations=30, class_of=CLASS_OF):
+    steps = rate * RULES[rule](system, mean, class_of)
+    return descend_means(system, mean, z, class_of, steps=steps, iterations=iterations)
+
+
+def random_regressions(rng):
+    return identity_regressions(2, 2) + 0.3 * rng.normal(size=(2, 2, 3))
+
+
+@pytest.mark.parametrize("kind", DENSE)
+def test_the_adjoint_is_equation_16(kind):
+    rng = np.random.default_rng(0)
+    models, clips, R = random_models(rng, kind), corpus(rng), random_regressions(rng)
+    system, z = system_of(models, clips)
+    _, slope = error_and_slope(system, R, models.mean, z, CLASS_OF)
+    dense, mean, covariance = dense_arguments(models, clips)
+    class_of = dict(zip(models.labels, CLASS_OF, strict=True))
+    want = regression_slope(dense, R, mean, covariance, class_of, SMOOTHNESS, 4)
+    np.testing.assert_allclose(slope, want, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", DENSE)
+def test_the_slope_is_that_of_central_differences(kind):
+    rng = np.random.default_rng(1)
+    models, clips, R = random_models(rng, kind), corpus(rng), random_regressions(rng)
+    system, z = system_of(models, clips)
+    error, slope = error_and_slope(system, R, models.mean, z, CLASS_OF)
+    dense, mean, covariance = dense_arguments(models, clips)
+
+    def dense_error(R):
+        moved = {
+            label: R[g] @ np.r_[1, mean[label]]
+            for label, g in zip(models.labels, CLASS_OF, strict=True)
+        }
+        return sum(
+            np.sum((own - dense_follow(*text, moved, covariance, SMOOTHNESS, 4)) ** 2)
+            for own, *text in dense
+        )
+
+    np.testing.assert_allclose(error, dense_error(R), rtol=1e-10)
+    for entry in np.ndindex(R.shape):
+        e = np.zeros_like(R)
+        e[entry] = 1e-4
+        central = (dense_error(R + e) - dense_error(R - e)) / 2e-4
+        np.testing.assert_allclose(slope[entry], central, rtol=1e-5, atol=1e-8)
+
+
+def test_it_starts_from_the_means_as_they_are():
+    rng = np.random.default_rng(2)
+    mean = rng.normal(size=(4, 2))
+    np.testing.assert_array_equal(regressed(identity_regressions(2, 2), mean, CLASS_OF), mean)
+    models, clips = random_models(rng), corpus(rng)
+    system, z = system_of(models, clips)
+    path = descend(system, models.mean, z, iterations=0)
+    np.testing.assert_array_equal(path, models.mean[None])
+
+
+def test_an_iteration_is_equation_17():
+    rng = np.random.default_rng(3)
+    models, clips = random_models(rng), corpus(rng)
+    system, z = system_of(models, clips)
+    path = descend(system, models.mean, z, "paper", rate=0.01, iterations=2)
+    R = identity_regressions(2, 2)
+    for moved in path[1:]:
+        R = R - 0.01 * error_and_slope(system, R, models.mean, z, CLASS_OF)[1]
+        np.testing.assert_allclose(moved, regressed(R, models.mean, CLASS_OF), rtol=1e-12)
+    assert len(path) == 3
+
+
+def test_curvature_is_that_of_free_trajectories():
+    """Were y = R_g xi_t, the Hessian of E in a row of R_g would be 2 sum xi xi'."""
+    rng = np.random.default_rng(4)
+    mean = rng.normal(size=(4, 2))
+    phone = np.array([0, 0, 2, 1, 1, 1])
+    curvature = class_curvature(phone, mean, np.array([0, 1, 0, 2]))
+    for g, rows in ((0, [0, 0, 2]), (1, [1, 1, 1])):
+        total = sum(np.outer(np.r_[1, mean[p]], np.r_[1, mean[p]]) for p in rows)
+        np.testing.assert_allclose(curvature[g], 2 * np.linalg.eigvalsh(total)[-1], rtol=1e-12)
+    assert curvature[2] == 0
+
+
+def test_steps_are_by_the_curvature_and_never_longer_than_by_that_bound():
+    models, system, _ = amplifying()
+    L = class_curvature(system.line.phone, models.mean, CLASS_OF)
+    c = gain(system, models.mean, CLASS_OF, 1 / L)
+    assert (c > 2).all()
+    steps = RULES["bounded"](system, models.mean, CLASS_OF)
+    np.testing.assert_allclose(steps, 1 / (L[:, None] * c), rtol=1e-12)
+    calm = factor_system(system.line, models, np.full(3, 1e-9))  # nothing is smoothed: c = 1
+    steps = RULES["bounded"](calm, models.mean, CLASS_OF)
+    np.testing.assert_allclose(steps, np.tile(1 / L[:, None], 3), rtol=1e-6)
+
+
+def many_clips(rng, n_clips=5, n_dims=6):
+    """About what 15 seconds hold: four phones in long and short runs, much silence (a)."""
+    clips = []
+    for _ in range(n_clips):
+        middle = [p for _ in range(12) for p in [str(rng.choice(list("bcd")))] * rng.integers(2, 6)]
+        labels = ["a"] * 15 + middle + ["a"] * 15
+        z = np.cumsum(rng.normal(size=(len(labels), n_dims)), axis=0) / 5
+        clips.append(Utterance(z, labels))
+    return clips
+
+
+def errors(system, path, z):
+    return np.array([np.sum((system.follow(mean) - z) ** 2) for mean in path])
+
+
+@pytest.mark.parametrize("kind", DENSE)
+@pytest.mark.parametrize("rate", RATES["bounded"])
+@pytest.mark.parametrize("smoothness", [0.01, 1.0, 100.0])
+def test_training_error_falls_with_every_iteration(kind, rate, smoothness):
+    rng = np.random.default_rng(5)
+    models, clips = random_models(rng, kind, n_dims=6), many_clips(rng)
+    system, z = system_of(models, clips, np.full(6, smoothness))
+    curve = errors(system, descend(system, models.mean, z, rate=rate), z)
+    assert len(curve) == 31
+    assert (np.diff(curve) < 0).all()
+    assert curve[-1] < 0.8 * curve[0]
+
+
+def amplifying():
+    """Silence of large variance at both ends: smoothing extrapolates what is next to it."""
+    rng = np.random.default_rng(9)
+    models = random_models(rng, n_dims=3)
+    variance = np.tile([[100.0], [0.01], [0.01], [0.01]], 3)
+    models = PhonemeModels(models.labels, models.mean, variance, models.count)
+    return models, *system_of(models, many_clips(rng, n_dims=3), np.full(3, 1000.0))
+
+
+def test_training_error_falls_where_smoothing_amplifies_and_the_plain_bound_does_not_hold():
+    models, system, z = amplifying()
+    assert (np.diff(errors(system, descend(system, models.mean, z), z)) < 0).all()
+    L = class_curvature(system.line.phone, models.mean, CLASS_OF)
+    plain = np.tile(1 / L[:, None], 3)
+    path = descend_means(system, models.mean, z, CLASS_OF, steps=plain)
+    assert (np.diff(errors(system, path, z)) > 0).any()
+
+
+@pytest.mark.parametrize("kind", DENSE)
+def test_gain_is_the_largest_curvature_in_units_of_that_bound(kind):
+    """The Hessian entry by entry: the slope at each unit matrix with nothing to meet."""
+    rng = np.random.default_rng(10)
+    models, clips = random_models(rng, kind), many_clips(rng, n_clips=2, n_dims=2)
+    system, z = system_of(models, clips)
+    L = class_curvature(system.line.phone, models.mean, CLASS_OF)
+    columns = []
+    for entry in np.ndindex(2, 2, 3):
+        unit = np.zeros((2, 2, 3))
+        unit[entry] = 1
+        columns.append(error_and_slope(system, unit, models.mean, 0 * z, CLASS_OF)[1].ravel())
+    root = np.repeat(1 / np.sqrt(L), 6)
+    hessian = root[:, None] * np.array(columns).T * root
+    row = np.tile(np.repeat([0, 1], 3), 2)  # dimension of each entry
+    if kind == "full":
+        want = [np.linalg.eigvalsh(hessian)[-1]]
+    else:
+        np.testing.assert_allclose(hessian[row == 0][:, row == 1], 0, atol=1e-12)
+        want = [np.linalg.eigvalsh(hessian[row == j][:, row == j])[-1] for j in (0, 1)]
+    found = gain(system, models.mean, CLASS_OF, 1 / L)
+    assert found.shape == (len(want),)
+    assert (found <= want * np.array(1 + 1e-12)).all()
+    assert (found > 0.75 * np.array(want)).all()
+
+
+def test_the_scale_of_the_coordinates_does_not_matter_much_to_the_bounded_rule():
+    """Where the means are large against 1, R xi is the same in other units."""
+    rng = np.random.default_rng(6)
+    models, clips = random_models(rng, n_dims=3), many_clips(rng, n_dims=3)
+    lam = np.ones(3)
+
+    def final(unit):
+        own = PhonemeModels(
+            models.labels, models.mean * unit, models.variance * unit**2, models.count
+        )
+        moved = [Utterance(u.z * unit, u.labels) for u in clips]
+        system, z = system_of(own, moved, lam / unit**2)
+        return descend(system, own.mean, z)[-1] / unit
+
+    np.testing.assert_allclose(final(1e4), final(1e3), rtol=1e-3)
+
+
+def test_the_papers_step_goes_down_if_small_and_else_diverges_and_stops_cleanly():
+    rng = np.random.default_rng(7)
+    models, clips = random_models(rng, n_dims=6), many_clips(rng)
+    system, z = system_of(models, clips, np.full(6, 1.0))
+    small = errors(system, descend(system, models.mean, z, "paper", rate=1e-4), z)
+    assert (np.diff(small) < 0).all()
+    path = descend(system, models.mean, z, "paper", rate=0.5, iterations=500)
+    large = errors(system, path, z)
+    assert (np.diff(large) > 0).all()
+    assert 10 < len(path) < 501
+    assert np.isfinite(large).all()
+
+
+def test_a_phone_without_frames_moves_with_its_class_and_a_class_without_frames_stays():
+    rng = np.random.default_rng(8)
+    models = random_models(rng)
+    clips = corpus(rng, texts=("aabbaab",))
+    system, z = system_of(models, clips)
+    class_of = np.array([0, 1, 0, 2])
+    moved = descend(system, models.mean, z, class_of=class_of)[-1]
+    assert abs(moved[2] - models.mean[2]).max() > 1e-2
+    np.testing.assert_array_equal(moved[3], models.mean[3])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rule": "steepest"}, "must be one of bounded, paper, got 'steepest'"),
+        ({"iterations": -1}, "must not be negative, got -1"),
+        ({"rates": (0.5, 1.5)}, "rates: must be above 0 and at most 1 with the rule bounded"),
+        ({"rates": (0.0,)}, "rates: must be above 0"),
+        ({"rule": "paper", "rates": (-1.0,)}, "rates: must be above 0 and at most inf"),
+    ],
+)
+def test_bad_descents_are_named(options, message):
+    with pytest.raises(InputError, match=message):
+        Descent(**options)
