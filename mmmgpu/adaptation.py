@@ -51,8 +51,7 @@ F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 CLASSES = ("kmeans", "paper")
-CLASS_COUNTS = (1, 3, 9)  # of k-means: which, is chosen by folds
-WITH_CLASSES = ("shift", "mllr", "gdlr")
+CLASS_COUNT = 4  # of k-means: 15 seconds hold too few phones for the paper's nine
 LEAST_S = 1.0  # of speech and silence together
 
 
@@ -61,8 +60,7 @@ class AdaptOptions:
     """What a person may choose about adaptation.
 
     method: one of `adaptation_folds.METHODS`; the others are kept in the model for comparison.
-    classes: one of `CLASSES`: k-means on the phoneme means, into as many as the folds like best, or
-        the paper's nine.
+    classes: one of `CLASSES`: k-means on the phoneme means, or the paper's nine.
     covariance: one of `reselection.COVARIANCES`, of the phoneme models after Eq. 13.
     step: one of `gdlr.RULES`.
     sync: [s] by which sound and alignments are moved against the picture; negative: earlier.
@@ -187,23 +185,22 @@ class _Adaptation:
             carry(stream.trained, matrix, covariance=options.covariance)
             for stream, matrix in zip((model.alpha, model.beta), to_new, strict=True)
         )
-        partitions = self._partitions(before)
+        classes = self._classes(before)
         analysed = analyse_corpus(
             self.folder, frames, basis, flow=options.flow, backend=self.backend
         )
         streams, others = [], []
         curves: dict[str, Any] = {}
-        classes: dict[str, Classes] = {}
         for name, old, carried, z in zip(
             ("alpha", "beta"), (model.alpha, model.beta), before, analysed, strict=True
         ):
             smoothness = scaled_smoothness(carried, old.constants.smoothness)
             start = replace(old, pooled=carried, trained=carried, smoothness=smoothness)
-            results = self._adapt(name, start, utterances_of(frames, z), partitions)
-            best, classes[name] = results[options.method]
+            results = self._adapt(name, start, utterances_of(frames, z), classes)
+            best = results[options.method]
             streams.append(_adapted_stream(start, best))
-            others.append({m: r.models.mean for m, (r, _) in results.items()})
-            curves[name] = {m: _curve(r) | {"classes": len(c)} for m, (r, c) in results.items()}
+            others.append({method: found.models.mean for method, found in results.items()})
+            curves[name] = {method: _curve(found) for method, found in results.items()}
         places = [frames.find(int(i)) for i in chosen]
         return Model(
             basis=basis,
@@ -244,47 +241,41 @@ class _Adaptation:
         alpha = np.stack([a for a, _ in found], axis=1)[:, old.moving]
         return alpha, np.stack([b for _, b in found], axis=1)
 
-    def _partitions(self, before: Sequence[PhonemeModels]) -> list[Classes]:
-        """The ways to group phones that are tried: little data wants few classes."""
+    def _classes(self, before: Sequence[PhonemeModels]) -> Classes:
+        """The phones that move together."""
         if self.options.classes == "paper":
-            return [paper_classes(before[0].labels)]
-        seed = self.options.seed
-        return [kmeans_classes(*before, count=count, seed=seed) for count in CLASS_COUNTS]
+            return paper_classes(before[0].labels)
+        return kmeans_classes(*before, count=CLASS_COUNT, seed=self.options.seed)
 
     def _adapt(
         self,
         name: str,
         start: TrainedStream,
         utterances: Sequence[Utterance],
-        partitions: Sequence[Classes],
-    ) -> dict[str, tuple[Adapted, Classes]]:
-        """One stream by every method, each with the classes that suit it best by its folds."""
+        classes: Classes,
+    ) -> dict[str, Adapted]:
+        """One stream by every method."""
         results = {}
         with progress_bar(None, f"adapt {name}") as advance:
             for method in METHODS:
-                tried = [
-                    adapt_models(
-                        start.pooled,
-                        utterances,
-                        smoothness=start.smoothness,
-                        order=start.constants.order,
-                        method=method,
-                        classes=classes,
-                        rng=np.random.default_rng(self.options.seed),
-                        descent=Descent(rule=self.options.step),
-                        progress=lambda done, total: advance(1),
-                    )
-                    for classes in (partitions if method in WITH_CLASSES else partitions[:1])
-                ]
-                best = int(np.argmin([found.validation.min() for found in tried]))
-                results[method] = tried[best], partitions[best]
+                results[method] = adapt_models(
+                    start.pooled,
+                    utterances,
+                    smoothness=start.smoothness,
+                    order=start.constants.order,
+                    method=method,
+                    classes=classes,
+                    rng=np.random.default_rng(self.options.seed),
+                    descent=Descent(rule=self.options.step),
+                    progress=lambda done, total: advance(1),
+                )
         return results
 
     def _notes(
         self,
         frames: Frames,
         skipped: Mapping[str, str],
-        classes: Mapping[str, Classes],
+        classes: Classes,
         curves: Mapping[str, Any],
     ) -> dict[str, Any]:
         kept = ("transferred_from", "matching")
@@ -298,7 +289,7 @@ class _Adaptation:
                 "method": self.options.method,
                 "covariance": self.options.covariance,
                 "step": self.options.step,
-                "classes": {name: [list(g) for g in groups] for name, groups in classes.items()},
+                "classes": [list(members) for members in classes],
                 "coverage": _coverage(frames),
                 "curves": dict(curves),
             },

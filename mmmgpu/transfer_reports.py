@@ -205,10 +205,7 @@ def _adaptation(model: Model) -> str:
         "without silence": f"{coverage['frames_per_phone_without_silence']:.2f}",
         "phones not seen": f"{len(coverage['phones_not_seen'])} of {len(coverage['frames'])}: "
         + ", ".join(coverage["phones_not_seen"]),
-        **{
-            f"classes of phones, {name}": "; ".join(" ".join(members) for members in groups)
-            for name, groups in found["classes"].items()
-        },
+        "classes of phones": "; ".join(" ".join(members) for members in found["classes"]),
     }
     rows = []
     for method, name in METHOD_NAMES.items():

@@ -33,7 +33,7 @@ from mmmgpu.corpus_steps import (
 )
 from mmmgpu.correspondence import Correspondence, rbf_correspondence
 from mmmgpu.errors import InputError
-from mmmgpu.flows import best_flow, matcher
+from mmmgpu.flows import Matcher, best_flow, matcher
 from mmmgpu.matching import BALANCE, MOUTH, Matching, View, match_prototypes
 from mmmgpu.models import Model
 from mmmgpu.parallel import one_thread_each
@@ -63,6 +63,7 @@ class TransferOptions:
 
 
 DEFAULTS = TransferOptions()
+MARGIN = 4  # [px] kept around the masks
 
 
 def transfer(
@@ -169,25 +170,31 @@ class _Transfer:
         reference, old = self._reference(), self.source.basis
         frames, skipped = self._track(reference)
         region, usable = reference.region, np.flatnonzero(frames.registered)
-        maps = self._correspondences(frames, region)
-        w_f, w_t = (carried_mask(m, maps[CLOSED], region.shape) for m in (old.w_f, old.w_t))
-        images = _good(frames, lambda clip, track: np.stack(list(crops(clip.path, track, region))))
-        flows = self._flows(frames, region)
+        to_region = self._correspondence(frames, CLOSED, region)
+        w_f, w_t = (carried_mask(m, to_region, region.shape) for m in (old.w_f, old.w_t))
+        near, inside = _about_mouth(region, np.maximum(w_f, w_t))
+        images = _good(frames, lambda clip, track: np.stack(list(crops(clip.path, track, near))))
+        flows = self._flows(frames, near, w_t[inside])
         views = [
-            View(self.marked[kind].prototype, maps[kind], self._source_flows(kind), flow)
+            View(
+                self.marked[kind].prototype,
+                self._correspondence(frames, kind, near),
+                self._source_flows(kind),
+                flow,
+            )
             for kind, flow in flows.items()
         ]
         closed = int(np.searchsorted(usable, self._number(frames, CLOSED)))
         matching = match_prototypes(
             old,
-            Basis(images, flows[CLOSED], 0, region, w_f, w_t, w_t),
+            Basis(images, flows[CLOSED], 0, near, w_f[inside], w_t[inside], w_t[inside]),
             views,
             fixed=[(old.reference, closed)],
             balance=self.options.balance,
             backend=self.backend,
         )
         chosen = matching.chosen
-        basis = make_basis(images[chosen], flows[CLOSED][chosen], old.reference, region)
+        basis = self._basis(frames, region, usable[chosen])
         places = [frames.find(int(i)) for i in usable[chosen]]
         return replace(
             self.source,
@@ -196,7 +203,7 @@ class _Transfer:
             prototype_frames=np.stack([frame_at(c.path, t) for c, t in places]),
             sources=tuple((c.path.name, t) for c, t in places),
             calm=calmest(frames),
-            notes=self._notes(frames, skipped, matching, maps),
+            notes=self._notes(frames, skipped, matching, views),
         )
 
     def _reference(self) -> Reference:
@@ -226,32 +233,29 @@ class _Transfer:
         at = self.marked[kind].pair.b
         return frames.number(at.clip, at.frame)
 
-    def _correspondences(self, frames: Frames, region: Region) -> dict[str, Correspondence]:
-        """S of each pair, from the pixels of A's stabilised region to those of B's."""
-        origin_a = np.array(self.source.basis.region.box[:2])
-        origin_b = np.array(region.box[:2])
-        maps = {}
-        for kind, marked in self.marked.items():
+    def _correspondence(self, frames: Frames, kind: str, region: Region) -> Correspondence:
+        """S of a pair, from the pixels of A's stabilised region to those of `region` of B."""
+        marked = self.marked[kind]
+        pose_a = np.eye(3)
+        if kind != CLOSED:
             picture = self.source.prototype_frames[marked.prototype]
-            pose_a = np.eye(3)
-            if kind != CLOSED:
-                pose_a = pose_of(picture, self.source.reference, f"the model's {kind} frame")
-            pose_b = frames.tracks[marked.pair.b.clip].poses[marked.pair.b.frame]
-            a = _carried_back(pose_a, marked.pair.points_a) - origin_a
-            b = _carried_back(pose_b, marked.pair.points_b) - origin_b
-            maps[kind] = rbf_correspondence(a, b)
-            if self._folded(maps[kind]):
-                print(
-                    f"warning: the {kind} points fold {100 * self._folded(maps[kind]):.1f} % of "
-                    "the mouth over; look for crossed points with: mmmgpu mark",
-                    file=sys.stderr,
-                )
-        return maps
+            pose_a = pose_of(picture, self.source.reference, f"the model's {kind} frame")
+        pose_b = frames.tracks[marked.pair.b.clip].poses[marked.pair.b.frame]
+        a = _carried_back(pose_a, marked.pair.points_a) - self.source.basis.region.box[:2]
+        b = _carried_back(pose_b, marked.pair.points_b) - region.box[:2]
+        return rbf_correspondence(a, b)
 
-    def _folded(self, s: Correspondence) -> float:
-        """Share of A's mouth that `s` folds over."""
+    def _folded(self, kind: str, s: Correspondence) -> float:
+        """Share of A's mouth that `s` folds over; a warning says so."""
         mouth = self.source.basis.w_t > MOUTH
-        return float(s.folds(*mouth.shape[::-1])[mouth].mean())
+        share = float(s.folds(*mouth.shape[::-1])[mouth].mean())
+        if share:
+            print(
+                f"warning: the {kind} points fold {100 * share:.1f} % of the mouth over; look for "
+                "crossed points with: mmmgpu mark",
+                file=sys.stderr,
+            )
+        return share
 
     def _source_flows(self, kind: str) -> F32:
         """Flows of A's prototypes from the reference frame of `kind`, (M, h, w, 2)."""
@@ -265,13 +269,26 @@ class _Transfer:
         flows = [best_flow(origin, image, basis.w_t, via, match) for image in basis.images]
         return np.stack(flows) * still
 
-    def _flows(self, frames: Frames, region: Region) -> dict[str, F32]:
-        """Flows of B's usable frames from each of its reference frames, (N, h', w', 2)."""
+    def _references(self, frames: Frames, region: Region) -> dict[str, F32]:
+        """`region` of B's reference frames."""
         pictures = {}
         for kind, marked in self.marked.items():
             track = frames.tracks[marked.pair.b.clip]
             pictures[kind] = crop(marked.picture, track.poses[marked.pair.b.frame], track, region)
-        shared = (self.folder, region, pictures, self.options.flow)
+        return pictures
+
+    def _basis(self, frames: Frames, region: Region, chosen: NDArray[np.int64]) -> Basis:
+        """The basis of the frames of B that are number `chosen`, on the whole region."""
+        origins, match = self._references(frames, region), matcher(self.options.flow)
+        images = frames.crops(sorted({int(i) for i in chosen}), region)
+        flow_to = _flow_finder(origins, CLOSED, mouth_mask(region), match)
+        flows = {i: flow_to(image) for i, image in images.items()}
+        pictures, moved = (np.stack([found[int(i)] for i in chosen]) for found in (images, flows))
+        return make_basis(pictures, moved, self.source.basis.reference, region)
+
+    def _flows(self, frames: Frames, region: Region, mask: F32) -> dict[str, F32]:
+        """Flows of B's usable frames from each of its reference frames, (N, h', w', 2)."""
+        shared = (self.folder, region, self._references(frames, region), mask, self.options.flow)
         items = [(clip, frames.tracks[clip.path.name]) for clip in frames.clips]
         for_all(self.folder, _flowing, shared, "flow", "flows of frames", items)
         flows = {}
@@ -288,7 +305,7 @@ class _Transfer:
         frames: Frames,
         skipped: Mapping[str, str],
         matching: Matching,
-        maps: Mapping[str, Correspondence],
+        views: Sequence[View],
     ) -> dict[str, Any]:
         kinds = list(self.marked)
         return {
@@ -308,7 +325,10 @@ class _Transfer:
                 "texture_distance": np.round(matching.texture_distance, 6).tolist(),
                 "reference": [kinds[v] for v in matching.view],
                 "different_frames": len(set(matching.chosen.tolist())),
-                "folded_share": {kind: self._folded(s) for kind, s in maps.items()},
+                "folded_share": {
+                    kind: self._folded(kind, view.correspondence)
+                    for kind, view in zip(kinds, views, strict=True)
+                },
             },
         }
 
@@ -334,24 +354,37 @@ def _good(frames: Frames, read: Callable[[Clip, Track], NDArray[Any]]) -> F32:
     return np.concatenate(parts)
 
 
-def _flowing(shared: tuple[Path, Region, Mapping[str, F32], str]) -> Work:
-    """Keeps the flows of every frame of a clip, from each reference: direct, or by another."""
-    folder, region, origins, flow = shared
+def _about_mouth(region: Region, mask: F32) -> tuple[Region, tuple[slice, slice]]:
+    """The part of `region` in which `mask` counts, as a region, and where it is in it."""
+    rows, columns = np.nonzero(mask > MOUTH)
+    top, bottom = max(0, rows.min() - MARGIN), min(mask.shape[0], rows.max() + 1 + MARGIN)
+    left, right = max(0, columns.min() - MARGIN), min(mask.shape[1], columns.max() + 1 + MARGIN)
+    x, y, *_ = region.box
+    box = (int(x + left), int(y + top), int(right - left), int(bottom - top))
+    return Region(box, region.mouth), (slice(top, bottom), slice(left, right))
+
+
+def _flow_finder(
+    origins: Mapping[str, F32], kind: str, mask: F32, match: Matcher
+) -> Callable[[F32], F32]:
+    """A function image -> flow from the reference `kind`: direct, or by another reference."""
+    origin = origins[kind]
+    via = [(image, match(origin, image)) for other, image in origins.items() if other != kind]
+    return lambda image: best_flow(origin, image, mask, via, match)
+
+
+def _flowing(shared: tuple[Path, Region, Mapping[str, F32], F32, str]) -> Work:
+    """Keeps the flows of every frame of a clip, from each reference."""
+    folder, region, origins, mask, flow = shared
     match = matcher(flow)
-    mask = mouth_mask(region)
-    between = {
-        kind: [
-            (origins[other], match(origin, origins[other])) for other in origins if other != kind
-        ]
-        for kind, origin in origins.items()
-    }
+    finders = {kind: _flow_finder(origins, kind, mask, match) for kind in origins}
 
     def work(item: tuple[Clip, Track], tick: Tick) -> None:
         clip, track = item
         flows: dict[str, list[F32]] = {kind: [] for kind in origins}
         for image in crops(clip.path, track, region):
-            for kind, origin in origins.items():
-                flows[kind].append(best_flow(origin, image, mask, between[kind], match))
+            for kind, flow_to in finders.items():
+                flows[kind].append(flow_to(image))
             tick()
         write_step(folder, f"flow-{clip.path.name}", {k: np.stack(f) for k, f in flows.items()})
 

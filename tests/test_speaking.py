@@ -6,7 +6,7 @@ import pytest
 from test_reconstruction import make_person, write_clip
 from worlds import POSTURES, hold, make_model
 
-from mmmgpu.alignments import Alignment, Segment
+from mmmgpu.alignments import Alignment, Segment, cover
 from mmmgpu.errors import InputError
 from mmmgpu.models import project_on_simplex, trajectories
 from mmmgpu.sounds import read_sound
@@ -213,3 +213,16 @@ def test_a_bad_background_is_refused(person, speech, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         speak(person, speech, out, background=tmp_path / "none.mkv", backend="numpy")
     assert not out.exists()
+
+
+def test_a_vowel_may_be_held_as_long_as_in_a_song(basis):
+    """Ten seconds of AA: the mouth gets to the vowel, stays there, and leaves again."""
+    model = replace(make_model(basis), fps=Fraction(25))
+    song = cover([Segment("AA", 0.4, 10.4)], 10.8)
+    planned = plan(model, Alignment(song, (), 10.8))
+    assert len(planned) == 270
+    middle = planned.alpha[100:170]
+    wanted = model.alpha.trained.mean[model.alpha.trained.labels.index("AA")]
+    np.testing.assert_allclose(middle, np.broadcast_to(wanted, middle.shape), atol=1e-3)
+    np.testing.assert_allclose(planned.beta.sum(axis=1), 1, atol=1e-12)
+    assert np.isfinite(planned.alpha).all()
