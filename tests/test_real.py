@@ -13,12 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mmmgpu.adaptation import adapt
 from mmmgpu.alignments import find_alignment, frame_labels, read_alignment
 from mmmgpu.evaluation import evaluate, measure_reconstruction
+from mmmgpu.landmark_points import points_from_landmarks
 from mmmgpu.model_files import load
+from mmmgpu.points import write_points
 from mmmgpu.reconstruction import reconstruct
+from mmmgpu.reference_pairs import choose_references, source_references
 from mmmgpu.speaking import speak
 from mmmgpu.training import Options, train
+from mmmgpu.transferring import transfer
 from mmmgpu.videos import probe
 from mmmgpu.voices import say
 
@@ -109,6 +114,37 @@ def test_larger_pictures_go_the_same_way(tmp_path):
     score = measure_reconstruction(model, clip, out, analysed, labels=labels, landmarks=clip.parent)
     assert score["least_cover_in_hull"] >= 0.99
     assert score["speech"]["psnr_db"] >= 30
+
+
+def adapt_to(s1, second, folder, landmarks):
+    """The model `s1` with the face and in the style of the person in the clips `second`."""
+    shown = source_references(s1), choose_references(second)
+    points = points_from_landmarks(*shown, Path(DATA) / "grid-s1", landmarks)
+    write_points(folder / "points.json", points)
+    before = transfer(s1, second, landmarks, folder / "points.json", folder / "before.mmm")
+    return adapt(before, second, landmarks, folder / "after.mmm")
+
+
+def test_a_second_person_from_fifteen_seconds(s1, tmp_path):
+    every = clips("grid-s4")
+    adapted = adapt_to(s1, every[:5], tmp_path, every[0].parent)
+    assert adapted.frame_size == (720, 576)
+    found = evaluate(adapted, every[6::4], every[0].parent, landmarks=every[0].parent)
+    for stream in ("alpha", "beta"):
+        gain = found[stream]["speech"]["rms_gain"]
+        assert gain["mean"] > gain["half_width_95"]  # better than no adaptation
+        curve = adapted.notes["adaptation"]["curves"][stream]["gdlr"]
+        errors = np.array(curve["training"])[curve["path"]]
+        assert (np.diff(errors) < 0).all()
+    gain = found["lips"]["distance_gain_px"]
+    assert gain["mean"] > 0
+
+
+def test_a_second_person_from_one_clip(s1, tmp_path):
+    clip = clips("grid-others")[1]
+    adapted = adapt_to(s1, [clip], tmp_path, clip.parent)
+    speak(adapted, say("Hello again."), tmp_path / "spoken.mp4")
+    assert probe(tmp_path / "spoken.mp4").frames > 10
 
 
 @pytest.mark.parametrize("number", [0, 5])
