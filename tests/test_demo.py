@@ -6,8 +6,10 @@ import pytest
 
 from mmmgpu import demo
 from mmmgpu.demo import HELD_OUT, NEW, Script, make_demo, mouth_closeup, write_side_by_side
+from mmmgpu.demo_second import SECOND, Second
 from mmmgpu.errors import InputError
 from mmmgpu.figures import CAPTION_HEIGHT
+from mmmgpu.model_files import load
 from mmmgpu.performances import SENTENCES, Stage
 from mmmgpu.sounds import read_sound
 from mmmgpu.video_writing import write_video
@@ -18,6 +20,7 @@ SHORT = {
     "seed": 5,
     "script": Script(("Papa bought a boat.", "We saw five fish."), ("My map.", "Oh boy."), "Bye."),
     "prototypes": 6,
+    "second": Second(8, ("Two boats.", "See my map."), ("Five fish.",)),
     "stage": Stage(size=(144, 160), silence=0.2, pace=220),
 }
 
@@ -38,6 +41,14 @@ def test_everything_lies_in_one_folder(made):
         "side-by-side.mp4",
         "report.html",
         "results.json",
+        "second",
+        "points.json",
+        "transferred.mmm",
+        "adapted.mmm",
+        "second-before.mp4",
+        "second-after.mp4",
+        "second-side-by-side.mp4",
+        "transfer-report.html",
     }
     assert json.loads((out / "results.json").read_text()) == results
     assert results["evaluation"]["clips"] == ["held-out-01.mp4", "held-out-02.mp4"]
@@ -74,6 +85,23 @@ def test_the_report_shows_both_videos(made):
     assert "Errors" in page
 
 
+def test_the_second_performer_speaks_before_and_after(made):
+    out, results = made
+    spoken = probe(out / "spoken.mp4")
+    both = probe(out / "second-side-by-side.mp4")
+    assert (both.width, both.frames, both.has_sound) == (2 * 160, spoken.frames, True)
+    first, second = load(out / "model.mmm"), load(out / "adapted.mmm")
+    assert set(second.notes["clips"]) == {"adapt-01.mp4", "adapt-02.mp4"}
+    assert len(second.sources) == len(first.sources)
+    judged = results["second"]["evaluation"]
+    assert judged["clips"] == ["judge-01.mp4"]
+    assert "also_in_training" not in judged
+    assert results["second"]["adaptation"]["coverage"]["frames"]["IY"] > 0
+    page = (out / "transfer-report.html").read_text()
+    assert page.count("data:video/mp4") == 2
+    assert "Adaptation" in page
+
+
 def test_a_finished_demo_keeps_its_model_and_says_what_to_open(made, monkeypatch, capsys):
     out, results = made
 
@@ -85,6 +113,7 @@ def test_a_finished_demo_keeps_its_model_and_says_what_to_open(made, monkeypatch
     said = capsys.readouterr()
     assert again["evaluation"] == results["evaluation"]
     assert str(out / "report.html") in said.out.splitlines()[-1]
+    assert str(out / "second-side-by-side.mp4") in said.out.splitlines()[-1]
     assert len(said.out.splitlines()) == 1
     assert "demo: learn the mouth" in said.err
     with pytest.raises(AssertionError, match="trained again"):
@@ -105,6 +134,7 @@ def test_without_a_voice_nothing_is_begun(tmp_path, monkeypatch):
 
 
 def test_what_is_judged_was_not_learned():
+    assert not set(SECOND.judged) & {*SECOND.adapted, *SENTENCES}
     assert not {*HELD_OUT, NEW} & set(SENTENCES)
     assert not [sentence for sentence, n in Counter([*SENTENCES, *HELD_OUT]).items() if n > 1]
     known = {phone.label for phone in say(" ".join(SENTENCES)).alignment.phones}
