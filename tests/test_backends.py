@@ -81,6 +81,21 @@ def test_a_device_may_be_named(name, explicit):
     assert type(k) is type(get_backend(name))
 
 
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("part", [np.s_[:, :, ::2], np.s_[::2], np.s_[:, ::-1], np.s_[..., :1]])
+def test_a_strided_array_is_read_as_it_is(name, part):
+    """As fancy indexing of a reshaped picture gives it, too."""
+    k = get_backend(name)
+    whole = np.random.default_rng(0).random((4, 6, 8, 3)).astype(np.float32)
+    weights = np.eye(len(whole[part]), dtype=np.float32)
+    blended = k.blend(k.to_device(whole[part]), k.to_device(weights))
+    assert_allclose(k.to_host(blended), whole[part], rtol=0, atol=1e-6)
+    some = whole.reshape(4, -1, 3)[:, np.array([3, 1, 40])]
+    one = np.ones(3, np.float32)
+    apart = k.distance_scan(k.to_device(some), k.to_device(some.copy()), k.to_device(one))
+    assert_allclose(np.diag(k.to_host(apart)), 0, rtol=0, atol=1e-6)
+
+
 def test_a_library_that_is_missing_says_what_to_install(monkeypatch):
     monkeypatch.setitem(backends.BACKENDS, "absent", "mmmgpu_no_such_module")
     with pytest.raises(InputError, match=r"needs 'mmmgpu_no_such_module'.*pip install"):

@@ -83,7 +83,8 @@ class Warp(Launches):
     threads: int  # launches in flight
 
     def to_device(self, array: NDArray[Any]) -> Any:
-        return wp.array(array, device=self.device, copy=False)
+        # a strided array would come with its strides, which the launches do not look at
+        return wp.array(np.ascontiguousarray(array), device=self.device, copy=False)
 
     def to_host(self, array: Any) -> F32:
         host: F32 = array.numpy()

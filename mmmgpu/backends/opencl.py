@@ -83,7 +83,7 @@ class OpenCL(Launches):
 
     def to_device(self, array: NDArray[Any]) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
-        data = cl.Buffer(self.queue.context, flags, hostbuf=array)
+        data = cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(array))
         return cl.array.Array(self.queue, array.shape, array.dtype, data=data)
 
     def to_host(self, array: Any) -> F32:

@@ -1,0 +1,328 @@
+"""Matching by synthesis against slow versions, small worlds made to measure, and known truth."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import oracles_matching as oracles
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from performer_pairs import found, make_pair, target_of, views_of
+from worlds import texture
+
+from mmmgpu import matching
+from mmmgpu.analysis import TEXTURE_RIDGE, solve_simplex
+from mmmgpu.basis import Basis
+from mmmgpu.correspondence import rbf_correspondence
+from mmmgpu.matching import (
+    View,
+    flow_distances,
+    match_prototypes,
+    nearest_view,
+    synthetic_flows,
+    texture_coordinates,
+)
+from mmmgpu.regions import Region, lip_mask, mouth_mask
+
+COUNT, FRAMES = 5, 7
+
+
+def smooth_flows(rng, count, h, w, size=2.0):
+    """Random smooth flows, (count, h, w, 2) float32, of about `size` px; the first is none."""
+    flows = [
+        cv2.GaussianBlur(rng.standard_normal((h, w, 2)).astype(np.float32), (0, 0), 4)
+        for _ in range(count)
+    ]
+    made = np.stack([size * f / np.abs(f).max() for f in flows])
+    made[0] = 0
+    return made.astype(np.float32)
+
+
+def basis_of(images, flows, region):
+    mouth = mouth_mask(region)
+    return Basis(images, flows, 0, region, lip_mask(region), mouth, mouth)
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    """A of 5 prototypes, B of 7 frames in pictures of other sizes, and two views of them."""
+    rng = np.random.default_rng(0)
+    a, b = Region((0, 0, 22, 18), (10.5, 8.0, 9.0)), Region((0, 0, 25, 21), (12.0, 9.5, 11.0))
+    pictures = [
+        np.stack([texture(*r.shape, seed=10 * i + n) for n in range(number)])
+        for i, (r, number) in enumerate(((a, COUNT), (b, FRAMES)))
+    ]
+    views = []
+    for reference in (0, 2):
+        marks = np.array([[2, 2], [9, 3], [18, 2], [4, 9], [11, 8], [17, 10], [6, 15], [14, 16.0]])
+        marks += rng.uniform(-1, 1, marks.shape)
+        moved = 1.15 * marks + rng.normal(0, 0.3, marks.shape)
+        flows = (smooth_flows(rng, n, *r.shape) for r, n in ((a, COUNT), (b, FRAMES)))
+        views.append(View(reference, rbf_correspondence(marks, moved), *flows))
+    source = basis_of(pictures[0], views[0].flows_a, a)
+    target = basis_of(pictures[1], views[0].flows_b, b)
+    return SimpleNamespace(
+        source=source, target=target, views=views, view=np.array([0, 1, 1, 0, 0])
+    )
+
+
+def test_flow_distances_are_equation_7(tiny, backend):
+    for name in ("numpy", backend):
+        got = flow_distances(tiny.source, tiny.views, tiny.view, backend=name)
+        wanted = [
+            [oracles.flow_distance(tiny.source, tiny.views[r], k, n) for n in range(FRAMES)]
+            for k, r in enumerate(tiny.view)
+        ]
+        assert_allclose(got, wanted, rtol=1e-5)
+
+
+def test_texture_coordinates_are_equation_8(tiny, backend):
+    for name in ("numpy", backend):
+        got = texture_coordinates(tiny.source, tiny.views, tiny.view, backend=name)
+        for k, r in enumerate(tiny.view):
+            wanted = oracles.texture_coordinates(tiny.source, tiny.views[r], k)
+            assert_allclose(got[:, k], wanted, atol=2e-4)
+
+
+def test_synthetic_flows_are_on_the_new_person_s_pixels(tiny):
+    shape = tiny.target.w_t.shape
+    got = synthetic_flows(tiny.views, tiny.view, shape)
+    assert got.dtype == np.float32
+    for k in (1, 3):
+        wanted = oracles.synthetic_flow(tiny.views[tiny.view[k]], k, shape)
+        # OpenCV reads a flow at 1/32 px
+        assert_allclose(got[k], wanted, atol=0.06)
+
+
+def test_the_texture_scan_is_equations_9_and_10(tiny, backend):
+    beta = np.random.default_rng(1).dirichlet(np.ones(COUNT), COUNT).T
+    candidates = np.array([3, 1, 6, 6, 0])
+    flows = synthetic_flows(tiny.views, tiny.view, tiny.target.w_t.shape)
+    wanted = [
+        [
+            oracles.texture_distance(
+                tiny.target, tiny.views[r], beta[:, k], candidates, flows[k], n
+            )
+            for n in range(FRAMES)
+        ]
+        for k, r in enumerate(tiny.view)
+    ]
+    for name in ("numpy", backend):
+        scan = matching._TextureScan(tiny.target, tiny.views, tiny.view, beta, name)
+        assert_allclose(scan(candidates), wanted, rtol=1e-4)
+        scan(np.array([3, 2, 2, 6, 0]))  # what was made before is not taken for what is new
+        assert_allclose(scan(candidates), wanted, rtol=1e-4)
+
+
+def test_a_synthesis_whose_candidates_stay_is_not_made_again(tiny, monkeypatch):
+    beta = np.eye(COUNT)[:, [1, 0, 1, 2, 3]]
+    scan = matching._TextureScan(tiny.target, tiny.views, tiny.view, beta, "numpy")
+    scan(np.array([0, 1, 2, 3, 4]))
+    real, made = matching.warp_prototypes, []
+
+    def counted(basis, *rest):
+        made.append(basis.images)
+        return real(basis, *rest)
+
+    monkeypatch.setattr(matching, "warp_prototypes", counted)
+    scan(np.array([0, 1, 5, 3, 6]))  # 2 is used for prototype 3 alone, 4 for none
+    assert len(made) == 1
+    assert_array_equal(made[0], tiny.target.images[[5]])
+
+
+def test_each_prototype_uses_the_view_whose_flow_explains_it(tiny):
+    images = tiny.source.images.copy()
+    still = tuple(replace(v, flows_a=np.zeros_like(v.flows_a)) for v in tiny.views)
+    images[4] = images[0] + 0.01
+    images[1] = images[2] + 0.01
+    got = nearest_view(replace(tiny.source, images=images), still)
+    assert got[[0, 1, 2, 4]].tolist() == [0, 1, 1, 0]
+
+
+@pytest.mark.parametrize("equal", [False, True])
+def test_the_programme_of_equation_8_is_solved(tiny, equal):
+    """Against every set of positive coordinates, and Karush-Kuhn-Tucker; two may be equal."""
+    images = tiny.source.images.copy()
+    flows = tiny.views[0].flows_a.copy()
+    if equal:
+        images[3], flows[3] = images[1], flows[1]
+    source, view = replace(tiny.source, images=images), replace(tiny.views[0], flows_a=flows)
+    for k in range(COUNT):
+        gram, right = oracles.texture_system(source, view, k)
+        singular = equal and k not in (1, 3)
+        assert (np.linalg.cond(gram) > 1e12) == singular
+        beta = solve_simplex(gram, right)
+        ridge = TEXTURE_RIDGE * np.trace(gram) / len(gram)
+        gram = gram + ridge * np.eye(len(gram))
+        scale = np.abs(right).max()
+        wanted = oracles.oracles_model.solve_simplex(gram, right)
+        assert_allclose(beta, wanted, atol=1e-6)
+        slope = (gram @ beta - right) / scale
+        price = beta @ slope  # the multiplier of sum b = 1
+        assert beta.min() >= 0
+        assert_allclose(beta.sum(), 1, atol=1e-12)
+        assert (slope >= price - 1e-6).all()
+        assert_allclose(slope[beta > 1e-6], price, atol=1e-6)
+
+
+def test_two_equal_prototypes_are_each_other(tiny):
+    images, flows = tiny.source.images.copy(), tiny.views[0].flows_a.copy()
+    images[3], flows[3] = images[1], flows[1]
+    source, views = replace(tiny.source, images=images), [replace(tiny.views[0], flows_a=flows)]
+    beta = texture_coordinates(source, views, np.zeros(COUNT, int), backend="numpy")
+    assert beta[3, 1] > 0.99
+    assert beta[1, 3] > 0.99
+    others = beta[:, [0, 2, 4]]
+    assert_allclose(others[1], others[3], atol=1e-3)  # they share what either would have
+    assert_array_equal(np.diag(beta), 0)
+    assert_allclose(beta.sum(axis=0), 1, atol=1e-12)
+
+
+class Scan:
+    """In place of the texture scan: distances (M, N) by what the candidates are."""
+
+    def __init__(self, distances):
+        self.distances, self.asked = distances, []
+
+    def __call__(self, candidates):
+        self.asked.append(candidates.tolist())
+        return self.distances(candidates)
+
+
+def match_stubbed(monkeypatch, flow, distances, **options):
+    """`match_prototypes` with given flow distances (M, N) and texture distances."""
+    scan = Scan(distances)
+    monkeypatch.setattr(matching, "nearest_view", lambda *_: np.zeros(len(flow), int))
+    monkeypatch.setattr(matching, "flow_distances", lambda *_, **__: np.array(flow, float))
+    monkeypatch.setattr(matching, "texture_coordinates", lambda *_, **__: np.eye(len(flow)))
+    monkeypatch.setattr(matching, "_TextureScan", lambda *_: scan)
+    return match_prototypes(None, None, [], **options), scan
+
+
+def wandering(seed, count=4, frames=6):
+    """Texture distances that depend on all candidates, at random, but always in the same way."""
+
+    def distances(candidates):
+        rng = np.random.default_rng([seed, *candidates.tolist()])
+        return rng.uniform(1, 2, (count, frames))
+
+    return distances
+
+
+@pytest.mark.parametrize("balance", [0.0, 0.3, 0.5, 1.0])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_iteration_is_that_of_the_paper(monkeypatch, balance, seed):
+    flow = np.random.default_rng(seed).uniform(1, 3, (4, 6))
+    got, _ = match_stubbed(monkeypatch, flow, wandering(seed), balance=balance, iterations=9)
+    history, costs = oracles.iterate(flow, wandering(seed), balance, 9)
+    assert_array_equal(got.history, history)
+    repeated = history[-1] in history[:-1]
+    first = history.index(history[-1]) if repeated else len(history)
+    kind = "limit" if not repeated else "fixed point" if first == len(history) - 2 else "cycle"
+    assert got.outcome == kind
+    inside = range(first, len(costs)) if kind == "cycle" else [len(costs) - 1]
+    best = min(inside, key=lambda i: costs[i])
+    assert_array_equal(got.chosen, history[best + 1])
+
+
+def test_flow_alone_and_texture_alone(monkeypatch):
+    flow = [[1.0, 2, 3], [3, 1, 2]]
+    texture_ = np.array([[3.0, 1, 2], [2, 3, 1]])
+    alone, _ = match_stubbed(monkeypatch, flow, lambda _: texture_, balance=1.0)
+    assert alone.chosen.tolist() == [0, 1]
+    assert alone.outcome == "fixed point"
+    alone, _ = match_stubbed(monkeypatch, flow, lambda _: texture_, balance=0.0)
+    assert alone.chosen.tolist() == [1, 2]
+    assert alone.history.tolist() == [[0, 1], [1, 2], [1, 2]]
+
+
+def test_what_is_known_is_not_chosen(monkeypatch):
+    flow = [[1.0, 2, 3], [3, 1, 2]]
+    got, scan = match_stubbed(monkeypatch, flow, lambda _: np.array(flow), fixed=[(1, 0)])
+    assert got.chosen.tolist() == [0, 0]
+    assert all(candidates[1] == 0 for candidates in scan.asked)
+    assert got.flow_distance[-1].tolist() == [0.5, 1.5]  # over the median, 2
+
+
+def test_two_prototypes_may_choose_one_frame(monkeypatch):
+    flow = [[1.0, 2, 3], [1, 2, 3]]
+    got, _ = match_stubbed(monkeypatch, flow, lambda _: np.array(flow))
+    assert got.chosen.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("cheap", [1, 2, 3])
+def test_of_a_cycle_the_least_total_cost_is_taken(monkeypatch, cheap):
+    """0 -> 1 -> 2 -> 3 -> 1: choosing `cheap` costs less than the others of the cycle.
+
+    The way into the cycle costs least, but is no part of it.
+    """
+    after = {0: 1, 1: 2, 2: 3, 3: 1}
+
+    def distances(candidates):
+        new = after[int(candidates[0])]
+        row = np.full((1, 4), 8.0)
+        row[0, new] = 1.0 if new == cheap else 2.0
+        return row if candidates[0] else row / 8
+
+    got, _ = match_stubbed(monkeypatch, [[1.0, 1.1, 1.1, 1.1]], distances)
+    assert got.history.ravel().tolist() == [0, 1, 2, 3, 1]
+    assert got.outcome == "cycle"
+    assert got.chosen.tolist() == [cheap]
+
+
+def test_the_unit_of_the_texture_stays_that_of_the_first_iteration(monkeypatch):
+    calls = []
+
+    def distances(_):
+        calls.append(1)
+        return np.array([[4.0, 2, 1]]) * (1 if len(calls) == 1 else 100)
+
+    got, _ = match_stubbed(monkeypatch, [[1.0, 2, 9]], distances)
+    assert got.history.ravel().tolist() == [0, 1, 2, 2]
+    assert got.texture_distance.ravel().tolist() == [2, 1, 50, 50]
+
+
+def test_the_limit_is_kept(monkeypatch):
+    got, scan = match_stubbed(monkeypatch, np.ones((4, 6)), wandering(3), balance=0.0, iterations=2)
+    assert got.outcome == "limit"
+    assert len(scan.asked) == 2
+    assert_array_equal(got.chosen, got.history[2])
+    assert got.flow_distance.shape == got.texture_distance.shape == (3, 4)
+
+
+def test_the_same_bits_twice_and_on_any_number_of_threads(tiny, backend, monkeypatch):
+    def bits():
+        got = match_prototypes(tiny.source, tiny.target, tiny.views, backend=backend)
+        parts = (got.chosen, got.history, got.flow_distance, got.texture_distance, got.texture)
+        return [part.tobytes() for part in parts]
+
+    first = bits()
+    assert bits() == first
+    for threads in (1, 5):
+        monkeypatch.setattr(matching, "default_threads", lambda n=threads: n)
+        assert bits() == first
+
+
+def test_every_backend_matches_alike(tiny, backend):
+    wanted, got = (
+        match_prototypes(tiny.source, tiny.target, tiny.views, backend=name)
+        for name in ("numpy", backend)
+    )
+    assert_array_equal(got.history, wanted.history)
+    assert_allclose(got.flow_distance, wanted.flow_distance, rtol=1e-4)
+    assert_allclose(got.texture_distance, wanted.texture_distance, rtol=1e-4)
+
+
+def test_most_counterparts_of_drawn_prototypes_are_found():
+    """One pair of performers with known truth; what all seeds reach is in docs/measurements.md."""
+    pair = make_pair(0)
+    views = views_of(pair)
+    fixed = [(0, int(pair.counterpart[0]))]
+    matching = match_prototypes(pair.source, target_of(pair, views), views, fixed=fixed)
+    by_flow, at_the_end = (
+        found(pair, chosen).mean() for chosen in (matching.history[0], matching.chosen)
+    )
+    assert by_flow > 0.7
+    assert at_the_end > max(0.8, by_flow)
+    assert len(matching.history) <= 10
