@@ -52,6 +52,7 @@ Floats = NDArray[np.float64]
 
 CLASSES = ("kmeans", "paper")
 CLASS_COUNT = 4  # of k-means: 15 seconds hold too few phones for the paper's nine
+OTHER_STEP = "gdlr_other_step"  # among the curves: GDLR with the step that was not chosen
 LEAST_S = 1.0  # of speech and silence together
 
 
@@ -254,11 +255,11 @@ class _Adaptation:
         utterances: Sequence[Utterance],
         classes: Classes,
     ) -> dict[str, Adapted]:
-        """One stream by every method."""
-        results = {}
+        """One stream by every method, and by GDLR with the step that was not chosen."""
         with progress_bar(None, f"adapt {name}") as advance:
-            for method in METHODS:
-                results[method] = adapt_models(
+
+            def by(method: str, step: str) -> Adapted:
+                return adapt_models(
                     start.pooled,
                     utterances,
                     smoothness=start.smoothness,
@@ -266,10 +267,14 @@ class _Adaptation:
                     method=method,
                     classes=classes,
                     rng=np.random.default_rng(self.options.seed),
-                    descent=Descent(rule=self.options.step),
+                    descent=Descent(rule=step),
                     progress=lambda done, total: advance(1),
                 )
-        return results
+
+            step = self.options.step
+            (other,) = (rule for rule in RULES if rule != step)
+            results = {method: by(method, step) for method in METHODS}
+            return results | {OTHER_STEP: by("gdlr", other)}
 
     def _notes(
         self,

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mmmgpu.adaptation import OTHER_STEP
 from mmmgpu.figures import Panel, curves, learning_curve, to_bytes
 from mmmgpu.files import write_text
 from mmmgpu.models import Model, trajectories
@@ -217,9 +218,11 @@ def _adaptation(model: Model) -> str:
         rows.append(cells)
     head = ("mean squared error", "alpha, used", "left out", "beta, used", "left out")
     drawings = "".join(
-        f'<figure class="small">{_descent(found["curves"][s]["gdlr"])}<figcaption>GDLR of {s}, '
-        "on the clips used and, by folds inside them, on those left out.</figcaption></figure>"
+        f'<figure class="small">{_descent(found["curves"][s][kind])}<figcaption>GDLR of {s} with '
+        f"the {step} step, on the clips used and, by folds inside them, on those left out."
+        "</figcaption></figure>"
         for s in ("alpha", "beta")
+        for kind, step in (("gdlr", found["step"]), (OTHER_STEP, "other"))
     )
     return (
         "<h2>Adaptation</h2><p>How the phoneme models were moved to the second person's own "

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mmmgpu.corpus_steps
-from mmmgpu.adaptation import AdaptOptions, adapt
+from mmmgpu.adaptation import OTHER_STEP, AdaptOptions, adapt
 from mmmgpu.adaptation_folds import METHODS
 from mmmgpu.alignments import Alignment, cover, read_alignment, write_textgrid
 from mmmgpu.corpora import open_corpus
@@ -106,7 +106,8 @@ def test_what_was_tried_is_kept(adapted):
     found = adapted[1].notes["adaptation"]
     for stream in ("alpha", "beta"):
         curves = found["curves"][stream]
-        assert set(curves) == set(METHODS)
+        assert set(curves) == {*METHODS, OTHER_STEP}
+        assert {own["rule"] for own in curves[OTHER_STEP]["candidates"]} == {"paper"}
         for curve in curves.values():
             assert len(curve["candidates"]) == len(curve["training"]) == len(curve["validation"])
             best = int(np.argmin(curve["validation"]))

@@ -35,7 +35,7 @@ def test_all_figures_are_there(two_persons, stages, tmp_path):
     assert "open: " in text  # Fig. 2
     for k in range(len(source.sources)):
         assert f"prototype {k}, and what was chosen for it" in text  # Fig. 3
-    assert text.count("<svg") == 3  # two descents and Fig. 4
+    assert text.count("<svg") == 5  # two descents of each stream, and Fig. 4
     for name in ("first person", "second, before", "second, after"):
         assert f"AA, {name}" in text  # Fig. 5
         assert f"UH, {name}" not in text  # never said
