@@ -6,7 +6,6 @@ Then the means are adapted to B's own trajectories, class by class (Eq. 14-17, `
 """
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,17 +24,16 @@ from mmmgpu.corpus_steps import (
     Thumbnails,
     analyse_corpus,
     calmest,
+    make_model,
     rebased_frames,
     track_corpus,
     tracking_notes,
     utterances_of,
-    work_folder,
 )
 from mmmgpu.errors import InputError
 from mmmgpu.flows import MATCHERS
 from mmmgpu.gdlr import RULES, Descent
 from mmmgpu.models import Model
-from mmmgpu.parallel import one_thread_each
 from mmmgpu.phonemes import PhonemeModels, Utterance, coverage
 from mmmgpu.phones import CE05_PHONES, SIL, ce05_phone
 from mmmgpu.progress import progress_bar
@@ -43,7 +41,6 @@ from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, principal_coordinates
 from mmmgpu.regression_classes import Classes, kmeans_classes, paper_classes
 from mmmgpu.reselection import COVARIANCES, carry
-from mmmgpu.tracks import frame_at
 from mmmgpu.trajectories import scaled_smoothness
 from mmmgpu.trajectory_training import History, TrainedStream
 
@@ -120,12 +117,12 @@ def adapt(
         "box": list(model.basis.region.box),
         "adapt": 1,
     }
-    folder = work_folder(out, corpus, given)
-    with one_thread_each():
-        adapted = _Adaptation(model, corpus, options, backend, folder).run()
-    adapted.save(out)
-    shutil.rmtree(folder)
-    return adapted
+    return make_model(
+        out,
+        corpus,
+        given,
+        lambda folder: _Adaptation(model, corpus, options, backend, folder).run(),
+    )
 
 
 def _check_options(options: AdaptOptions) -> None:
@@ -202,15 +199,15 @@ class _Adaptation:
             streams.append(_adapted_stream(start, best))
             others.append({method: found.models.mean for method, found in results.items()})
             curves[name] = {method: _curve(found) for method, found in results.items()}
-        places = [frames.find(int(i)) for i in chosen]
+        whole, sources = frames.pictures(chosen)
         return Model(
             basis=basis,
             reference=model.reference,
             alpha=streams[0],
             beta=streams[1],
             fps=model.fps,
-            prototype_frames=np.stack([frame_at(c.path, t) for c, t in places]),
-            sources=tuple((c.path.name, t) for c, t in places),
+            prototype_frames=whole,
+            sources=sources,
             calm=calmest(frames),
             notes=self._notes(frames, skipped, classes, curves),
             alternatives={

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from mmmgpu.backends import Backend
-from mmmgpu.basis import Basis, cut
+from mmmgpu.basis import LIP, MOUTH, Basis, around, cut
 from mmmgpu.errors import InputError
 from mmmgpu.flows import Matcher, best_flow, matcher, pull
 from mmmgpu.synthesis import NO_TEXTURE, warp_prototypes
@@ -39,7 +39,6 @@ OUTLIER = 0.2  # a pixel that differs by more than this counts less in a step
 WAYPOINTS = 1  # prototypes tried as waypoints of the flow to a frame
 NEAREST = 16  # prototypes that the first estimate of beta is made of
 STILL = 1e-6  # [px^2] mean square of a flow that is none
-MARGIN = 4  # [px] kept around the masks
 THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are looked for
 
 
@@ -76,8 +75,9 @@ def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
     Raises:
         InputError: The prototypes do not move against each other.
     """
-    basis, inside = _tight(basis)
-    pixels = np.flatnonzero(basis.w_f > 0.02)
+    inside = around((basis.w_t > MOUTH) | (basis.w_f > LIP))
+    basis = cut(basis, inside)
+    pixels = np.flatnonzero(basis.w_f > LIP)
     weight = basis.w_f.ravel()[pixels]
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
     x, y = moving[..., 0].T, moving[..., 1].T
@@ -88,7 +88,7 @@ def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
             "the mouth never moves in the prototypes; give clips of speech, or --region X,Y,W,H"
         )
     regular = gram.astype(np.float64) + FLOW_RIDGE * energy * np.eye(len(gram))
-    texture = np.flatnonzero(basis.w_t > 0.01)
+    texture = np.flatnonzero(basis.w_t > MOUTH)
     return Analyzer(
         basis=basis,
         inside=inside,
@@ -105,21 +105,17 @@ def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
     )
 
 
+def byte_thumbnail(image: F32, mask: F32) -> NDArray[np.uint8]:
+    """`thumbnail` of a picture in [0, 1] in whole grey levels: what is kept of every frame."""
+    return np.round(thumbnail(image, mask) * 255).astype(np.uint8)
+
+
 def thumbnail(image: F32, mask: F32) -> F32:
     """A small masked copy of `image` (h, w, 3) as a vector, for comparing frames at a glance."""
     h, w = image.shape[:2]
     size = (THUMBNAIL, max(1, round(THUMBNAIL * h / w)))
     small = cv2.resize(image * mask[..., None], size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.float32).ravel()
-
-
-def _tight(basis: Basis) -> tuple[Basis, tuple[slice, slice]]:
-    """`basis` cut to where its masks are not zero, and where that is."""
-    rows, columns = np.nonzero((basis.w_t > 0.01) | (basis.w_f > 0.02))
-    h, w = basis.w_t.shape
-    left, right = max(0, columns.min() - MARGIN), min(w, columns.max() + 1 + MARGIN)
-    top, bottom = max(0, rows.min() - MARGIN), min(h, rows.max() + 1 + MARGIN)
-    return cut(basis, left, top, right, bottom), (slice(top, bottom), slice(left, right))
 
 
 def analyze(analyzer: Analyzer, image: F32, kernels: Backend) -> tuple[Floats, Floats]:
@@ -189,13 +185,20 @@ def _fit_texture(
     basis = analyzer.basis
     on_device = warp_prototypes(basis, basis.flow(alpha), used, kernels)
     warped = kernels.to_host(on_device).reshape(len(used), -1, 3)
-    weight = analyzer.texture_weight[:, None]
-    a = (warped[:, analyzer.texture_pixels] * weight).reshape(len(used), -1)
-    b = (image.reshape(-1, 3)[analyzer.texture_pixels] * weight).ravel()
     beta = np.zeros(len(basis.images))
-    beta[used] = solve_simplex(a @ a.T, a @ b)
+    beta[used] = fit_mixture(warped, image, analyzer.texture_pixels, analyzer.texture_weight)
     made = beta[used].astype(np.float32) @ warped.reshape(len(used), -1)
     return beta, made.reshape(image.shape)
+
+
+def fit_mixture(warped: F32, image: F32, pixels: NDArray[np.int64], weight: F32) -> Floats:
+    """The weights (n,) on the simplex with which pictures mix to `image` best.
+
+    warped: (n, h w, 3). image: (h, w, 3). pixels, weight: those that count, and sqrt(w_t) there.
+    """
+    a = (warped[:, pixels] * weight[:, None]).reshape(len(warped), -1)
+    b = (image.reshape(-1, 3)[pixels] * weight[:, None]).ravel()
+    return solve_simplex(a @ a.T, a @ b)
 
 
 def solve_simplex(gram: F32, right: F32) -> Floats:

@@ -9,6 +9,9 @@ from mmmgpu.regions import Region, cover_mask, lip_mask, mouth_mask
 
 F32 = NDArray[np.float32]
 
+LIP, MOUTH = 0.02, 0.01  # least w_f and w_t of a pixel that counts
+MARGIN = 4  # [px] kept around the pixels that count
+
 
 @dataclass(frozen=True)
 class Basis:
@@ -43,23 +46,43 @@ class Basis:
         return summed
 
 
-def cut(basis: Basis, left: int, top: int, right: int, bottom: int) -> Basis:
-    """The part of a basis in columns left <= x < right and rows top <= y < bottom."""
-    box = (basis.region.box[0] + left, basis.region.box[1] + top, right - left, bottom - top)
-    inside = (slice(top, bottom), slice(left, right))
+def around(counts: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """The rows and columns that hold the pixels that count, (h, w), with a margin."""
+    rows, columns = np.nonzero(counts)
+    h, w = counts.shape
+    return (
+        slice(max(0, int(rows.min()) - MARGIN), min(h, int(rows.max()) + 1 + MARGIN)),
+        slice(max(0, int(columns.min()) - MARGIN), min(w, int(columns.max()) + 1 + MARGIN)),
+    )
+
+
+def still_outside(flows: F32, cover: F32) -> F32:
+    """`flows` (..., h, w, 2) fading to 0 where `cover` (h, w) does: outside, the head is rigid."""
+    return np.asarray(flows * np.minimum(1, 2 * cover)[..., None], np.float32)
+
+
+def part_of(region: Region, inside: tuple[slice, slice]) -> Region:
+    """The rows and columns `inside` of a region."""
+    (top, bottom), (left, right) = ((s.start, s.stop) for s in inside)
+    box = (region.box[0] + left, region.box[1] + top, right - left, bottom - top)
+    return Region(box, region.mouth)
+
+
+def cut(basis: Basis, inside: tuple[slice, slice]) -> Basis:
+    """The rows and columns `inside` of a basis."""
     return Basis(
         np.ascontiguousarray(basis.images[:, inside[0], inside[1]]),
         np.ascontiguousarray(basis.flows[:, inside[0], inside[1]]),
         basis.reference,
-        Region(box, basis.region.mouth),
+        part_of(basis.region, inside),
         *(np.ascontiguousarray(mask[inside]) for mask in (basis.w_f, basis.w_t, basis.cover)),
     )
 
 
 def make_basis(images: F32, flows: F32, reference: int, region: Region) -> Basis:
-    """A `Basis` whose flows fade to 0 where its cover does: outside, the head is rigid."""
+    """A `Basis` whose flows fade to 0 where its cover does, with the masks of `region`."""
     cover = cover_mask(region)
-    still = flows * np.minimum(1, 2 * cover)[..., None]
+    still = still_outside(flows, cover)
     still[reference] = 0
     w_f, w_t = lip_mask(region), mouth_mask(region)
-    return Basis(images, still.astype(np.float32), reference, region, w_f, w_t, cover)
+    return Basis(images, still, reference, region, w_f, w_t, cover)

@@ -1,11 +1,12 @@
-"""What training and transfer do with every clip of a corpus: track it, cut it, analyse it.
+"""What all jobs do with every clip of a corpus: track it, cut it, analyse it.
 
 What is found for a clip is kept in a folder of finished steps (`mmmgpu.checkpoints`); worker
 processes do the clips.
 """
 
+import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.analysis import analyze, prepare_analysis, thumbnail
+from mmmgpu.analysis import analyze, byte_thumbnail, prepare_analysis
 from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.basis import Basis
 from mmmgpu.checkpoints import (
@@ -25,26 +26,35 @@ from mmmgpu.checkpoints import (
 )
 from mmmgpu.corpora import Clip
 from mmmgpu.errors import InputError
-from mmmgpu.models import Calm
+from mmmgpu.models import Calm, Model
+from mmmgpu.parallel import one_thread_each
 from mmmgpu.phonemes import Utterance
 from mmmgpu.processes import Tick, Work, share_out
 from mmmgpu.progress import progress_bar
 from mmmgpu.regions import Region, mouth_mask
-from mmmgpu.tracks import Reference, Track, crop, crops, rebase, track_clip
+from mmmgpu.tracks import Reference, Track, crop, crops, frame_at, rebase, track_clip
 from mmmgpu.videos import read_frames
 
 Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
 
-def work_folder(out: Path, corpus: Sequence[Clip], given: Mapping[str, Any]) -> Path:
-    """The folder beside `out` for the finished steps of a job on `corpus`.
+def make_model(
+    out: Path, corpus: Sequence[Clip], given: Mapping[str, Any], job: Callable[[Path], Model]
+) -> Model:
+    """Do `job`, which is given the folder for its finished steps, and save its model to `out`.
 
-    given: options and whatever else the steps depend on, as JSON values.
+    The folder lies beside `out` until then. given: options and whatever else the steps depend on,
+    as JSON values.
     """
     said = [[list(phone) for phone in clip.alignment.phones] for clip in corpus]
     mark = fingerprint([clip.path for clip in corpus], {**given, "said": said})
-    return open_checkpoints(out.with_name(out.name + ".work"), mark)
+    folder = open_checkpoints(out.with_name(out.name + ".work"), mark)
+    with one_thread_each():
+        model = job(folder)
+    model.save(out)
+    shutil.rmtree(folder)
+    return model
 
 
 def for_all(
@@ -112,7 +122,7 @@ def _tracking(shared: tuple[Path, Reference, F32]) -> Work:
             return
         small = []
         for image in crops(clip.path, track, reference.region):
-            small.append(np.round(thumbnail(image, mask) * 255).astype(np.uint8))
+            small.append(byte_thumbnail(image, mask))
             tick()
         arrays = vars(track) | {"residual": np.array(track.residual)}
         write_step(folder, f"track-{clip.path.name}", {**arrays, "thumbnails": np.array(small)})
@@ -182,6 +192,14 @@ class Frames:
                 return clip, i
             i -= clip.info.frames
         raise IndexError(i)
+
+    def pictures(
+        self, numbers: Iterable[int]
+    ) -> tuple[NDArray[np.uint8], tuple[tuple[str, int], ...]]:
+        """Some frames in full, (n, H, W, 3), and the clip name and frame number of each."""
+        places = [self.find(int(i)) for i in numbers]
+        whole = np.stack([frame_at(clip.path, t) for clip, t in places])
+        return whole, tuple((clip.path.name, t) for clip, t in places)
 
     def number(self, name: str, t: int) -> int:
         """The number in the row of frame `t` of the clip called `name`."""

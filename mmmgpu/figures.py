@@ -23,10 +23,14 @@ Bytes = NDArray[np.uint8]
 Floats = NDArray[np.floating[Any]]
 
 INK = "#010203"  # of text and frames: replaced by the colour of the page's text, light or dark
+_BEFORE = {"color": "#d9730d", "linewidth": 1.4, "linestyle": (0, (4, 2))}
+_AFTER = {"color": "#1d7fd6", "linewidth": 1.8}
 STYLES: Mapping[str, Mapping[str, Any]] = {
     "real": {"color": INK, "linewidth": 2.6, "alpha": 0.45},
-    "before training": {"color": "#d9730d", "linewidth": 1.4, "linestyle": (0, (4, 2))},
-    "after training": {"color": "#1d7fd6", "linewidth": 1.8},
+    "before training": _BEFORE,
+    "after training": _AFTER,
+    "before adaptation": _BEFORE,
+    "after adaptation": _AFTER,
 }
 QUALITY = 90  # of JPEG
 CAPTION_HEIGHT = 28  # [px]

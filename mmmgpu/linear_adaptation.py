@@ -34,7 +34,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.phonemes import PhonemeModels
+from mmmgpu.phonemes import PhonemeModels, sum_by
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -100,6 +100,5 @@ def map_means(models: PhonemeModels, phone: Rows, z: Array, *, tau: float) -> Ar
 
 def _phone_sums(models: PhonemeModels, phone: Rows, z: Array) -> tuple[Rows, Array]:
     """n_p, shape (P,), and the sum of z_t over t in p, shape (P, d)."""
-    total = np.zeros_like(models.mean)
-    np.add.at(total, phone, z)
-    return np.bincount(phone, minlength=len(total)), total
+    count = len(models.mean)
+    return np.bincount(phone, minlength=count), sum_by(phone, z, count)

@@ -23,9 +23,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.analysis import solve_simplex
+from mmmgpu.analysis import fit_mixture
 from mmmgpu.backends import default_threads, get_backend
-from mmmgpu.basis import Basis
+from mmmgpu.basis import LIP, MOUTH, Basis
 from mmmgpu.correspondence import Correspondence
 from mmmgpu.flows import explanation_error
 from mmmgpu.parallel import map_ordered
@@ -37,7 +37,6 @@ Numbers = NDArray[np.int64]
 
 BALANCE = 0.5  # t of the paper
 MOST_ITERATIONS = 30
-LIP, MOUTH = 0.02, 0.01  # least w_f and w_t of a pixel that counts
 
 
 @dataclass(frozen=True)
@@ -192,17 +191,16 @@ def texture_coordinates(
     kernels = get_backend(backend, 1)
     bases = [replace(source, flows=v.flows_a) for v in views]
     pixels = np.flatnonzero(source.w_t > MOUTH)
-    weight = np.sqrt(source.w_t.ravel()[pixels])[:, None]
+    weight = np.sqrt(source.w_t.ravel()[pixels])
     every = np.arange(len(view))
 
     def one(k: int, _: Any) -> Floats:
         others = every[every != k]
         basis = bases[view[k]]
         warped = kernels.to_host(warp_prototypes(basis, basis.flows[k], others, kernels))
-        a = (warped.reshape(len(others), -1, 3)[:, pixels] * weight).reshape(len(others), -1)
-        b = (source.images[k].reshape(-1, 3)[pixels] * weight).ravel()
+        warped = warped.reshape(len(others), -1, 3)
         column = np.zeros(len(every))
-        column[others] = solve_simplex(a @ a.T, a @ b)
+        column[others] = fit_mixture(warped, source.images[k], pixels, weight)
         return column
 
     return np.stack(list(map_ordered(one, every.tolist(), threads=default_threads())), axis=1)

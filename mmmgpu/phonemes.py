@@ -135,8 +135,8 @@ def pool(
     phone = row[: len(spoken)]
     count = np.bincount(phone, minlength=len(names))
     frames = np.maximum(count, 1)[:, None]
-    mean = np.where(count[:, None], _sum_by(phone, z, len(names)) / frames, z.mean(axis=0))
-    spread = _sum_by(phone, (z - mean[phone]) ** 2, len(names)) / frames
+    mean = np.where(count[:, None], sum_by(phone, z, len(names)) / frames, z.mean(axis=0))
+    spread = sum_by(phone, (z - mean[phone]) ** 2, len(names)) / frames
     whole = positive(z.var(axis=0))
     variance = np.where(count[:, None], np.maximum(spread, floor_share * whole), whole)
     return PhonemeModels(tuple(names.tolist()), mean, variance, count)
@@ -152,7 +152,7 @@ def _stack(utterances: Sequence[Utterance]) -> tuple[NDArray[np.float64], list[s
     return z, [label for u in utterances for label in u.labels]
 
 
-def _sum_by(group: NDArray[np.int64], x: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+def sum_by(group: NDArray[np.int64], x: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     """Sum of the rows of x (N, d) in each of n groups, shape (n, d)."""
     total = np.zeros((n, x.shape[1]))
     np.add.at(total, group, x)

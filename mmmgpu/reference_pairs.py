@@ -7,6 +7,7 @@ the most open one. A person may choose others (`mark`); `transfer` takes those t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -14,20 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.alignments import Alignment
-from mmmgpu.analysis import thumbnail
+from mmmgpu.analysis import byte_thumbnail
 from mmmgpu.basis import Basis
 from mmmgpu.corpora import Clip
+from mmmgpu.corpus_steps import Frames
 from mmmgpu.errors import InputError
 from mmmgpu.flows import matcher
 from mmmgpu.models import Model
 from mmmgpu.parallel import one_thread_each
+from mmmgpu.points import CLOSED, OPEN
 from mmmgpu.progress import progress_bar
-from mmmgpu.prototypes import principal_coordinates
-from mmmgpu.references import check_sound, find_reference
-from mmmgpu.regions import Region, lip_mask, mouth_mask
+from mmmgpu.prototypes import most_neutral, principal_coordinates
+from mmmgpu.references import check_sound, find_reference, loudness
+from mmmgpu.regions import Region, carried_mouth, lip_mask, mouth_mask
 from mmmgpu.registration import MINIMUM_CORRELATION, project, register
-from mmmgpu.sounds import energy, read_sound
-from mmmgpu.tracks import Reference, Track, crops, frame_at, track_clip
+from mmmgpu.tracks import Reference, crops, frame_at, track_clip
 from mmmgpu.videos import probe
 
 F32 = NDArray[np.float32]
@@ -35,7 +37,6 @@ Floats = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 
 QUIET = 0.2  # share of the frames that count as quiet: those with the least sound
-CLOSED, OPEN = "closed", "open"
 NONE_GIVEN: Mapping[str, tuple[str, int]] = MappingProxyType({})
 
 
@@ -122,33 +123,21 @@ def choose_references(
         check_sound(corpus)
     with one_thread_each():
         reference = find_reference(corpus, region, sync=sync)
-        tracks = _tracks(corpus, reference)
-        corpus = [clip for clip in corpus if clip.path.name in tracks]
-        mask = mouth_mask(reference.region)
-        small = [
-            np.stack([_bytes(thumbnail(image, mask)) for image in _crops(clip, tracks, reference)])
-            for clip in corpus
-        ]
-        usable = np.concatenate([tracks[clip.path.name].registered for clip in corpus])
-        quiet = np.concatenate([_loudness(clip, sync) for clip in corpus])
-        quiet = quiet <= np.quantile(quiet[usable], QUIET)
-        closed = _most_usual(principal_coordinates(small), quiet & usable)
-        opened = _most_open_frame(corpus, tracks, reference, closed)
-    by_name = {clip.path.name: clip for clip in corpus}
-    places = {CLOSED: _place(corpus, closed), OPEN: _place(corpus, opened)}
+        frames = _tracked(corpus, reference)
+        numbers = {CLOSED: _most_usual(frames, reference.region, sync)}
+        numbers[OPEN] = _most_open_frame(frames, reference.region, numbers[CLOSED])
+    places = {kind: frames.find(i) for kind, i in numbers.items()}
+    by_name = {clip.path.name: clip for clip in frames.clips}
     for kind, (name, t) in given.items():
         if name not in by_name:
             raise InputError(f"{name}: the head was not found in this clip; choose another frame")
         places[kind] = (by_name[name], t)
-    return {
-        kind: ShownFrame(
-            clip.path.name,
-            t,
-            frame_at(clip.path, t),
-            _carried(reference.region, tracks[clip.path.name].poses[t]),
-        )
-        for kind, (clip, t) in places.items()
-    }
+    shown = {}
+    for kind, (clip, t) in places.items():
+        name = clip.path.name
+        mouth = _carried(reference.region, frames.tracks[name].poses[t])
+        shown[kind] = ShownFrame(name, t, frame_at(clip.path, t), mouth)
+    return shown
 
 
 def _check_given(corpus: Sequence[Clip], given: Mapping[str, tuple[str, int]]) -> None:
@@ -166,7 +155,8 @@ def _silent_clip(path: Path) -> Clip:
     return Clip(path, info, Alignment((), (), info.duration))
 
 
-def _tracks(corpus: Sequence[Clip], reference: Reference) -> dict[str, Track]:
+def _tracked(corpus: Sequence[Clip], reference: Reference) -> Frames:
+    """The clips in which the head is found."""
     tracks, reasons = {}, []
     with progress_bar(len(corpus), "find the head") as advance:
         for clip in corpus:
@@ -177,60 +167,37 @@ def _tracks(corpus: Sequence[Clip], reference: Reference) -> dict[str, Track]:
             advance(1)
     if not tracks:
         raise reasons[0]
-    return tracks
+    return Frames([clip for clip in corpus if clip.path.name in tracks], tracks)
 
 
-def _crops(clip: Clip, tracks: dict[str, Track], reference: Reference) -> list[F32]:
-    return list(crops(clip.path, tracks[clip.path.name], reference.region))
+def _most_usual(frames: Frames, region: Region, sync: float) -> int:
+    """The quiet frame nearest to the median of the quiet ones."""
+    mask = mouth_mask(region)
+    small, sound = [], []
+    for clip in frames.clips:
+        images = crops(clip.path, frames.tracks[clip.path.name], region)
+        small.append(np.stack([byte_thumbnail(image, mask) for image in images]))
+        count = clip.info.frames
+        sound.append(loudness(clip, count, sync) if clip.info.has_sound else np.zeros(count))
+    usable, loud = frames.registered, np.concatenate(sound)
+    quiet = (loud <= np.quantile(loud[usable], QUIET)) & usable
+    numbers = np.flatnonzero(quiet)
+    return int(numbers[most_neutral(principal_coordinates(small), numbers, quiet)])
 
 
-def _bytes(image: F32) -> NDArray[np.uint8]:
-    return np.round(image * 255).astype(np.uint8)
-
-
-def _loudness(clip: Clip, sync: float) -> Floats:
-    """RMS of the sound in each frame, (T,); zero without sound."""
-    if not clip.info.has_sound:
-        return np.zeros(clip.info.frames)
-    samples, rate = read_sound(clip.path)
-    late = round(sync * rate)
-    moved = np.pad(samples, (late, 0)) if late > 0 else samples[-late:]
-    return energy(moved, rate, clip.info.frames, float(clip.info.fps))
-
-
-def _most_usual(coordinates: F32, allowed: NDArray[np.bool_]) -> int:
-    """The allowed frame nearest to the median of the allowed ones."""
-    numbers = np.flatnonzero(allowed)
-    middle = np.median(coordinates[numbers], axis=0)
-    return int(numbers[((coordinates[numbers] - middle) ** 2).sum(axis=1).argmin()])
-
-
-def _most_open_frame(
-    corpus: Sequence[Clip], tracks: dict[str, Track], reference: Reference, closed: int
-) -> int:
-    match, weight = matcher(), lip_mask(reference.region)
-    clip, t = _place(corpus, closed)
-    origin = _crops(clip, tracks, reference)[t]
+def _most_open_frame(frames: Frames, region: Region, closed: int) -> int:
+    match, weight = matcher(), lip_mask(region)
+    origin = frames.crops([closed], region)[closed]
     scores = []
-    for clip in corpus:
-        good = tracks[clip.path.name].registered
-        for image, usable in zip(_crops(clip, tracks, reference), good, strict=True):
+    for clip in frames.clips:
+        track = frames.tracks[clip.path.name]
+        for image, usable in zip(crops(clip.path, track, region), track.registered, strict=True):
             flow = match(origin, image)
-            scores.append(openness(flow, reference.region, weight) if usable else -np.inf)
+            scores.append(openness(flow, region, weight) if usable else -np.inf)
     return int(np.argmax(scores))
-
-
-def _place(corpus: Sequence[Clip], number: int) -> tuple[Clip, int]:
-    """The clip and its frame that are `number` of all frames in a row."""
-    for clip in corpus:
-        if number < clip.info.frames:
-            return clip, number
-        number -= clip.info.frames
-    raise IndexError(number)
 
 
 def _carried(region: Region, pose: Floats) -> tuple[float, float, float]:
     """The mouth (x, y, width) [px] where `pose` sees it."""
-    x, y, width = region.mouth
-    ends = project(pose, np.array([[x, y], [x - width / 2, y], [x + width / 2, y]]))
-    return float(ends[0, 0]), float(ends[0, 1]), float(np.hypot(*(ends[2] - ends[1])))
+    x, y, width = carried_mouth(region.mouth, partial(project, pose))
+    return x, y, width

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 import cv2
@@ -12,6 +13,7 @@ from mmmgpu.corpora import Clip
 from mmmgpu.errors import InputError
 from mmmgpu.regions import (
     Region,
+    carried_mouth,
     locate_mouth,
     refine_centre,
     region_around,
@@ -95,7 +97,7 @@ def _find_mouth(sample: Sequence[Clip], sync: float) -> tuple[float, float, floa
     total, scale = np.zeros(0, np.float32), 1.0
     for clip in sample:
         small, scale = shrink(islice(read_frames(clip.path), SEARCH_FRAMES))
-        motion = speech_motion(small, _energy(clip, len(small), sync))
+        motion = speech_motion(small, loudness(clip, len(small), sync))
         total = motion if not total.size else total + _fit(motion, total.shape)
     x, y, width = (value / scale for value in locate_mouth(total))
     return x, y, width
@@ -111,7 +113,8 @@ def _fit(motion: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.floa
     return np.asarray(resized, np.float32)
 
 
-def _energy(clip: Clip, frames: int, sync: float) -> Floats:
+def loudness(clip: Clip, frames: int, sync: float) -> Floats:
+    """RMS of the sound in each of the first `frames` frames, moved by `sync` [s]; (frames,)."""
     samples, rate = read_sound(clip.path)
     late = round(sync * rate)
     moved = np.pad(samples, (late, 0)) if late > 0 else samples[-late:]
@@ -138,7 +141,7 @@ def _second_look(
             pictures.append(np.asarray(seen_now, np.uint8))
             inside = cv2.warpPerspective(np.ones_like(gray), matrix, (side, side), flags=flags)
             seen = np.minimum(seen, inside)
-        total += speech_motion(pictures, _energy(clip, len(pictures), sync))
+        total += speech_motion(pictures, loudness(clip, len(pictures), sync))
     total *= cv2.erode(seen, np.ones((9, 9)))  # the edge of the picture moves with the head
     u, v = refine_centre(total, REFINED_WIDTH)
     carried = project(to_frame, np.array([[u, v]]))[0]
@@ -153,15 +156,12 @@ def rebase_reference(
     size: (width, height) [px] of the frame. keep_box: move the box as it is, it was given.
     """
     pose, old = track.poses[t], reference.region
-    x, y, width = old.mouth
-    ends = project(pose, np.array([[x, y], [x - width / 2, y], [x + width / 2, y]]))
-    scale = float(np.hypot(*(ends[2] - ends[1]))) / width
-    mouth = (float(ends[0, 0]), float(ends[0, 1]), width * scale)
+    mouth = carried_mouth(old.mouth, partial(project, pose))
     region = region_around(mouth, size)
     if keep_box:
-        left = round(min(max(old.box[0] + mouth[0] - x, 0), size[0] - old.box[2]))
-        top = round(min(max(old.box[1] + mouth[1] - y, 0), size[1] - old.box[3]))
-        region = Region((left, top, *old.box[2:]), mouth)
+        left = round(min(max(old.box[0] + mouth[0] - old.mouth[0], 0), size[0] - old.box[2]))
+        top = round(min(max(old.box[1] + mouth[1] - old.mouth[1], 0), size[1] - old.box[3]))
+        region = Region((left, top, *old.box[2:]), (mouth[0], mouth[1], mouth[2]))
     head = replace(reference.head, to_frame=pose @ reference.head.to_frame)
     colours = ((reference.colours - track.offset) / track.gain).astype(np.float32)
     return Reference(head, colours, project(pose, reference.colour_points), region)

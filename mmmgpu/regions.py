@@ -4,7 +4,7 @@ Nothing here looks at landmarks. Near the mouth the picture changes more while t
 while there is none; blinks and head motion do not care about the sound.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,6 +56,13 @@ def region_around(mouth: Sequence[float], frame_size: tuple[int, int]) -> Region
     right = min(frame_size[0], round(x + (HALF_WIDTH + edge) * width))
     bottom = min(frame_size[1], round(y + (BELOW + edge) * width))
     return Region((left, top, right - left, bottom - top), (x, y, width))
+
+
+def carried_mouth(mouth: Sequence[float], carry: Callable[[Floats], Floats]) -> list[float]:
+    """(x, y, width) [px] of `mouth` after a map of points, (n, 2) -> (n, 2)."""
+    x, y, width = mouth
+    middle, left, right = carry(np.array([[x, y], [x - width / 2, y], [x + width / 2, y]]))
+    return [float(middle[0]), float(middle[1]), float(np.hypot(*(right - left)))]
 
 
 def region_from_box(box: tuple[int, int, int, int], frame_size: tuple[int, int]) -> Region:

@@ -2,6 +2,7 @@
 
 import base64
 import os
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,13 @@ def video(caption: str, path: Path, page: Path) -> str:
         "</video>"
     )
     return f"<figure>{player}{text}</figure>"
+
+
+def videos_section(videos: Mapping[str, Path], page: Path) -> str:
+    """Players with captions, where there are videos, for the file `page`."""
+    if not videos:
+        return ""
+    return "<h2>Videos</h2>" + "".join(video(c, v, page) for c, v in videos.items())
 
 
 def small(image: NDArray[Any]) -> NDArray[np.uint8]:

@@ -27,7 +27,7 @@ from mmmgpu.files import write_text
 from mmmgpu.models import Model, phonemes_of, project_on_simplex, trajectories
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phones import SIL, VISEMES, arpabet
-from mmmgpu.report_parts import PAGE, figure, pair, small, tile, video
+from mmmgpu.report_parts import PAGE, figure, pair, small, tile, videos_section
 from mmmgpu.report_tables import error_table, fact_table, lip_table, picture_table
 from mmmgpu.synthesis import synthesize_one
 from mmmgpu.trajectory_files import Trajectory
@@ -67,7 +67,7 @@ def write_report(
     with one_thread_each():
         sections = [
             _summary(model),
-            _videos(videos or {}, Path(path)),
+            videos_section(videos or {}, Path(path)),
             _reference(model),
             _prototypes(model),
             _flows(model),
@@ -111,12 +111,6 @@ def _summary(model: Model) -> str:
         "<p>The unrest of the registration is how far the measured head position jumps about from "
         "frame to frame; it is smoothed away before anything is learned. Below a pixel is good.</p>"
     )
-
-
-def _videos(videos: Mapping[str, Path], page: Path) -> str:
-    if not videos:
-        return ""
-    return "<h2>Videos</h2>" + "".join(video(c, v, page) for c, v in videos.items())
 
 
 def _reference(model: Model) -> str:
@@ -236,7 +230,9 @@ def _training(model: Model, backend: str) -> str:
     errors = {
         f"{name} (clips learned from)": stream.history.training.sum(axis=1)
         for name, stream in (("alpha, movement", alpha), ("beta, texture", model.beta))
+        if len(stream.history.training)  # adaptation keeps other curves, in the notes
     }
+    curve = learning_curve(errors) if errors else ""
     constants = "; ".join(
         f"{name}: smoothness {c.smoothness:g}, order {c.order}, ridge {c.ridge:g}, "
         f"{c.iterations} iterations"
@@ -247,7 +243,7 @@ def _training(model: Model, backend: str) -> str:
         "mouth: while one phone is said, the mouth is on its way to the next. Training moves the "
         "means until the whole movement fits. These phones were moved most.</p>"
         f"<div class='tiles wide'>{pairs}</div>"
-        f'<figure class="small">{learning_curve(errors)}<figcaption>The squared error of the '
+        f'<figure class="small">{curve}<figcaption>The squared error of the '
         "movement made from the phones, on the clips learned from, as training goes on. Constants "
         f"chosen by cross-validation inside these clips: {constants}.</figcaption></figure>"
     )
@@ -258,13 +254,7 @@ def _movement(model: Model, held_out: Trajectory) -> str:
         name: trajectories(model, held_out.labels, kind=kind)
         for name, kind in (("before training", "pooled"), ("after training", "trained"))
     }
-    panels = []
-    for stream, name in enumerate(("alpha", "beta")):
-        real = (held_out.alpha, held_out.beta)[stream]
-        numbers = model.basis.moving if name == "alpha" else np.arange(real.shape[1])
-        for j in np.argsort(-real.var(axis=0))[:2]:
-            shown = {"real": real[:, j], **{kind: y[stream][:, j] for kind, y in made.items()}}
-            panels.append(Panel(f"{name} of prototype {numbers[j]}", shown))
+    panels = coefficient_panels(model, held_out, made, most=2)
     alphas = {"real": held_out.alpha, **{kind: y[0] for kind, y in made.items()}}
     opening = {kind: _opening(model, alpha) for kind, alpha in alphas.items()}
     panels.insert(0, Panel("lips apart [px]", opening))
@@ -277,6 +267,19 @@ def _movement(model: Model, held_out: Trajectory) -> str:
         f'</p><figure class="scroll">{drawing}<figcaption>Top: how much further the lips are '
         "apart than in the reference, by the model's own flow.</figcaption></figure>"
     )
+
+
+def coefficient_panels(
+    model: Model, real: Trajectory, made: Mapping[str, tuple[Floats, Floats]], *, most: int
+) -> list[Panel]:
+    """The coefficients of each stream that move most: real, and `made`, (alpha, beta) by name."""
+    panels = []
+    for stream, (name, z) in enumerate((("alpha", real.alpha), ("beta", real.beta))):
+        numbers = model.basis.moving if name == "alpha" else np.arange(z.shape[1])
+        for j in np.argsort(-z.var(axis=0))[:most]:
+            shown = {"real": z[:, j], **{kind: y[stream][:, j] for kind, y in made.items()}}
+            panels.append(Panel(f"{name} of prototype {numbers[j]}", shown))
+    return panels
 
 
 def _opening(model: Model, alpha: Floats) -> Floats:

@@ -6,7 +6,6 @@ result until the job is done; in memory stay the PCA and model coordinates of th
 """
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,20 +20,18 @@ from mmmgpu.corpus_steps import (
     Thumbnails,
     analyse_corpus,
     calmest,
+    make_model,
     rebased_frames,
     track_corpus,
     tracking_notes,
     utterances_of,
-    work_folder,
 )
 from mmmgpu.models import Model
-from mmmgpu.parallel import one_thread_each
 from mmmgpu.phones import SIL
 from mmmgpu.progress import progress_bar
 from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordinates
 from mmmgpu.references import check_sound, find_reference, rebase_reference
-from mmmgpu.tracks import frame_at
 from mmmgpu.trajectory_training import TrainedStream, fit_stream
 
 Floats = NDArray[np.float64]
@@ -89,12 +86,10 @@ def train(
     check_rates(corpus)
     if options.region is None:
         check_sound(corpus)
-    folder = work_folder(out, corpus, {"options": vars(options), "steps": 1})
-    with one_thread_each():
-        model = _Training(corpus, options, backend, folder).run()
-    model.save(out)
-    shutil.rmtree(folder)
-    return model
+    given = {"options": vars(options), "steps": 1}
+    return make_model(
+        out, corpus, given, lambda folder: _Training(corpus, options, backend, folder).run()
+    )
 
 
 @dataclass(frozen=True)
@@ -125,15 +120,15 @@ class _Training:
         alphas, betas = analyse_corpus(self.folder, frames, basis, flow=flow, backend=self.backend)
         alpha = self._phonemes(frames, "alpha", alphas)
         beta = self._phonemes(frames, "beta", betas)
-        places = [frames.find(int(i)) for i in chosen]
+        whole, sources = frames.pictures(chosen)
         return Model(
             basis=basis,
             reference=reference,
             alpha=alpha,
             beta=beta,
             fps=used[0].info.fps,
-            prototype_frames=np.stack([frame_at(c.path, f) for c, f in places]),
-            sources=tuple((c.path.name, f) for c, f in places),
+            prototype_frames=whole,
+            sources=sources,
             calm=calmest(frames),
             notes=_notes(frames, skipped, self.options),
         )

@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from mmmgpu.errors import InputError
-from mmmgpu.phonemes import PhonemeModels, StandIn, Utterance, segment_durations
+from mmmgpu.phonemes import PhonemeModels, StandIn, Utterance, segment_durations, sum_by
 
 LEAST_WEIGHT = 0.02  # of D^2: an utterance of a single phone would have D = 0 and no solution
 
@@ -176,8 +176,7 @@ class System:
             E and dE/dmu, shape (P, d).
         """
         residual = self.follow(mean) - z
-        slope = np.zeros_like(mean)
-        np.add.at(slope, self.line.phone, self._pull(self._solve(2 * residual)))
+        slope = sum_by(self.line.phone, self._pull(self._solve(2 * residual)), len(mean))
         return float(np.sum(residual**2)), slope
 
     def _pull(self, x: Array) -> Array:

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.adaptation import OTHER_STEP
-from mmmgpu.figures import Panel, curves, learning_curve, to_bytes
+from mmmgpu.figures import curves, learning_curve, to_bytes
 from mmmgpu.files import write_text
 from mmmgpu.models import Model, trajectories
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.points import PointPair, read_points
-from mmmgpu.report_parts import PAGE, figure, small, tile, video
+from mmmgpu.report_parts import PAGE, figure, small, tile, videos_section
 from mmmgpu.report_tables import fact_table, table
-from mmmgpu.reports import mean_picture
+from mmmgpu.reports import coefficient_panels, mean_picture
 from mmmgpu.tracks import frame_at
 from mmmgpu.trajectory_files import Trajectory
 
@@ -68,7 +68,7 @@ def write_transfer_report(
     with one_thread_each():
         sections = [
             _introduction(before),
-            _videos(videos or {}, Path(path)),
+            videos_section(videos or {}, Path(path)),
             _marked(points, source) if source else "",
             _matched(source, before) if source else "",
             _history(before),
@@ -103,12 +103,6 @@ def _introduction(model: Model) -> str:
         "<h1>A second face</h1>\n<p>A mouth that was learned from one person's long video is given "
         "to a second person, of whom there are only seconds.</p>" + fact_table(facts)
     )
-
-
-def _videos(videos: Mapping[str, Path], page: Path) -> str:
-    if not videos:
-        return ""
-    return "<h2>Videos</h2>" + "".join(video(c, v, page) for c, v in videos.items())
 
 
 def _marked(points: tuple[tuple[PointPair, Bytes], ...], source: Model) -> str:
@@ -239,14 +233,9 @@ def _descent(curve: Mapping[str, Any]) -> str:
 
 
 def _movement(model: Model, real: Trajectory) -> str:
-    kinds = (("before training", "pooled"), ("after training", "trained"))
+    kinds = (("before adaptation", "pooled"), ("after adaptation", "trained"))
     made = {name: trajectories(model, real.labels, kind=kind) for name, kind in kinds}
-    panels = []
-    for stream, (name, z) in enumerate((("alpha", real.alpha), ("beta", real.beta))):
-        numbers = model.basis.moving if name == "alpha" else np.arange(z.shape[1])
-        j = int(np.argmax(z.var(axis=0)))
-        shown = {"real": z[:, j], **{kind: y[stream][:, j] for kind, y in made.items()}}
-        panels.append(Panel(f"{name} of prototype {numbers[j]}", shown))
+    panels = coefficient_panels(model, real, made, most=1)
     drawing = curves(panels, real.labels, float(real.fps))
     return (
         "<h2>Movement</h2><p>The flow and the texture coefficient that move most in a clip of the "

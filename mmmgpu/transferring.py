@@ -7,7 +7,6 @@ stay A's: B speaks in A's style until `adaptation`.
 """
 
 import os
-import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.basis import Basis, make_basis
+from mmmgpu.basis import MOUTH, Basis, around, make_basis, part_of, still_outside
 from mmmgpu.checkpoints import write_step
 from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.corpus_steps import (
@@ -26,21 +25,20 @@ from mmmgpu.corpus_steps import (
     calmest,
     finished_step,
     for_all,
+    make_model,
     rebased_frames,
     track_corpus,
     tracking_notes,
-    work_folder,
 )
 from mmmgpu.correspondence import Correspondence, rbf_correspondence
 from mmmgpu.errors import InputError
 from mmmgpu.flows import Matcher, best_flow, matcher
-from mmmgpu.matching import BALANCE, MOUTH, Matching, View, match_prototypes
+from mmmgpu.matching import BALANCE, Matching, View, match_prototypes
 from mmmgpu.models import Model
-from mmmgpu.parallel import one_thread_each
-from mmmgpu.points import PointPair, check_frames, read_points
+from mmmgpu.points import CLOSED, PointPair, check_frames, read_points
 from mmmgpu.processes import Tick, Work
-from mmmgpu.reference_pairs import CLOSED, pose_of
-from mmmgpu.regions import Region, mouth_mask, region_around
+from mmmgpu.reference_pairs import pose_of
+from mmmgpu.regions import Region, carried_mouth, mouth_mask, region_around
 from mmmgpu.registration import head_from_frame, project
 from mmmgpu.tracks import Reference, Track, crop, crops, frame_at, make_reference
 
@@ -63,7 +61,6 @@ class TransferOptions:
 
 
 DEFAULTS = TransferOptions()
-MARGIN = 4  # [px] kept around the masks
 
 
 def transfer(
@@ -105,12 +102,12 @@ def transfer(
         "sources": [list(place) for place in source.sources],
         "transfer": 1,
     }
-    folder = work_folder(out, corpus, given)
-    with one_thread_each():
-        model = _Transfer(source, corpus, marked, options, backend, folder).run()
-    model.save(out)
-    shutil.rmtree(folder)
-    return model
+    return make_model(
+        out,
+        corpus,
+        given,
+        lambda folder: _Transfer(source, corpus, marked, options, backend, folder).run(),
+    )
 
 
 @dataclass(frozen=True)
@@ -172,8 +169,9 @@ class _Transfer:
         region, usable = reference.region, np.flatnonzero(frames.registered)
         to_region = self._correspondence(frames, CLOSED, region)
         w_f, w_t = (carried_mask(m, to_region, region.shape) for m in (old.w_f, old.w_t))
-        near, inside = _about_mouth(region, np.maximum(w_f, w_t))
-        images = _good(frames, lambda clip, track: np.stack(list(crops(clip.path, track, near))))
+        inside = around(np.maximum(w_f, w_t) > MOUTH)
+        near = part_of(region, inside)
+        images = _images(frames, near)
         flows = self._flows(frames, near, w_t[inside])
         views = [
             View(
@@ -195,13 +193,13 @@ class _Transfer:
         )
         chosen = matching.chosen
         basis = self._basis(frames, region, usable[chosen])
-        places = [frames.find(int(i)) for i in usable[chosen]]
+        whole, sources = frames.pictures(usable[chosen])
         return replace(
             self.source,
             basis=replace(basis, w_f=w_f, w_t=w_t),
             reference=reference,
-            prototype_frames=np.stack([frame_at(c.path, t) for c, t in places]),
-            sources=tuple((c.path.name, t) for c, t in places),
+            prototype_frames=whole,
+            sources=sources,
             calm=calmest(frames),
             notes=self._notes(frames, skipped, matching, views),
         )
@@ -210,12 +208,10 @@ class _Transfer:
         """B's closed frame, with A's mouth carried to where it is in it."""
         closed = self.marked[CLOSED]
         s = rbf_correspondence(closed.pair.points_a, closed.pair.points_b)
-        x, y, width = self.source.reference.region.mouth
-        middle, left, right = s([[x, y], [x - width / 2, y], [x + width / 2, y]])
-        mouth = np.array([*middle, np.hypot(*(right - left))])
-        height, across = closed.picture.shape[:2]
-        region = region_around(mouth.tolist(), (across, height))
-        return make_reference(closed.picture, head_from_frame(closed.picture, mouth), region)
+        mouth = carried_mouth(self.source.reference.region.mouth, s)
+        height, width = closed.picture.shape[:2]
+        head = head_from_frame(closed.picture, np.array(mouth))
+        return make_reference(closed.picture, head, region_around(mouth, (width, height)))
 
     def _track(self, reference: Reference) -> tuple[Frames, dict[str, str]]:
         """B's frames as the closed reference frame sees them: its own pose is the identity."""
@@ -265,9 +261,8 @@ class _Transfer:
         origin = basis.images[self.marked[kind].prototype]
         closed = basis.images[basis.reference]
         via = [(closed, match(origin, closed))]
-        still = np.minimum(1, 2 * basis.cover)[..., None]
         flows = [best_flow(origin, image, basis.w_t, via, match) for image in basis.images]
-        return np.stack(flows) * still
+        return still_outside(np.stack(flows), basis.cover)
 
     def _references(self, frames: Frames, region: Region) -> dict[str, F32]:
         """`region` of B's reference frames."""
@@ -291,14 +286,12 @@ class _Transfer:
         shared = (self.folder, region, self._references(frames, region), mask, self.options.flow)
         items = [(clip, frames.tracks[clip.path.name]) for clip in frames.clips]
         for_all(self.folder, _flowing, shared, "flow", "flows of frames", items)
-        flows = {}
-        for kind in self.marked:
-
-            def of_kind(clip: Clip, _: Track, kind: str = kind) -> NDArray[Any]:
-                return finished_step(self.folder, "flow", clip.path.name)[kind]
-
-            flows[kind] = _good(frames, of_kind)
-        return flows
+        parts: dict[str, list[F32]] = {kind: [] for kind in self.marked}
+        for clip in frames.clips:
+            step = finished_step(self.folder, "flow", clip.path.name)
+            for kind, flows in parts.items():
+                flows.append(step[kind][frames.tracks[clip.path.name].registered])
+        return {kind: np.concatenate(flows) for kind, flows in parts.items()}
 
     def _notes(
         self,
@@ -345,23 +338,14 @@ def carried_mask(mask: F32, s: Correspondence, shape: tuple[int, int]) -> F32:
     return np.asarray(cv2.remap(mask, p[..., 0], p[..., 1], cv2.INTER_LINEAR), np.float32)
 
 
-def _good(frames: Frames, read: Callable[[Clip, Track], NDArray[Any]]) -> F32:
-    """What `read` gives for the frames of every clip, only those whose head was found."""
-    parts = []
+def _images(frames: Frames, region: Region) -> F32:
+    """`region` of every frame whose head was found, (N, h, w, 3)."""
+    found = []
     for clip in frames.clips:
         track = frames.tracks[clip.path.name]
-        parts.append(read(clip, track)[track.registered])
-    return np.concatenate(parts)
-
-
-def _about_mouth(region: Region, mask: F32) -> tuple[Region, tuple[slice, slice]]:
-    """The part of `region` in which `mask` counts, as a region, and where it is in it."""
-    rows, columns = np.nonzero(mask > MOUTH)
-    top, bottom = max(0, rows.min() - MARGIN), min(mask.shape[0], rows.max() + 1 + MARGIN)
-    left, right = max(0, columns.min() - MARGIN), min(mask.shape[1], columns.max() + 1 + MARGIN)
-    x, y, *_ = region.box
-    box = (int(x + left), int(y + top), int(right - left), int(bottom - top))
-    return Region(box, region.mouth), (slice(top, bottom), slice(left, right))
+        seen = zip(crops(clip.path, track, region), track.registered, strict=True)
+        found += [image for image, good in seen if good]
+    return np.stack(found)
 
 
 def _flow_finder(

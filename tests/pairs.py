@@ -7,6 +7,7 @@ import numpy as np
 from commands import trained_model
 from worlds import World, make_world
 
+import mmmgpu.corpus_steps
 from mmmgpu.landmark_points import points_from_landmarks
 from mmmgpu.model_files import load
 from mmmgpu.performer import landmarks
@@ -23,6 +24,20 @@ class TwoPersons:
     source: Path
     second: World
     points: Path
+
+
+def interrupt_second_step(monkeypatch):
+    """Ctrl-C comes when work is shared out for the second time; the list of what was shared out."""
+    share_out, calls = mmmgpu.corpus_steps.share_out, []
+
+    def once(*args, **options):
+        calls.append(args[2])
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        share_out(*args, **options)
+
+    monkeypatch.setattr(mmmgpu.corpus_steps, "share_out", once)
+    return calls
 
 
 def write_landmarks(world):

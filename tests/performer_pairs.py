@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from worlds import hold, say, sentence_motion
 
-from mmmgpu.basis import Basis, make_basis
+from mmmgpu.basis import Basis, make_basis, still_outside
 from mmmgpu.correspondence import rbf_correspondence
 from mmmgpu.flows import best_flow, matcher
 from mmmgpu.marking import LANDMARK_ROWS
@@ -220,8 +220,7 @@ def _basis_of_a(face, shows, rng):
     opened = most_open(make_basis(images, direct, 0, region))
     closed, from_open = _flows(images, [0, opened], mouth_mask(region))
     basis = make_basis(images, closed, 0, region)
-    fade = np.minimum(1, 2 * basis.cover)[..., None]
-    return basis, opened, {"closed": basis.flows, "open": from_open * fade}
+    return basis, opened, {"closed": basis.flows, "open": still_outside(from_open, basis.cover)}
 
 
 def _basis_of_b(face, shows, origins, rng):

@@ -3,8 +3,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from pairs import interrupt_second_step
 
-import mmmgpu.corpus_steps
 from mmmgpu.adaptation import OTHER_STEP, AdaptOptions, adapt
 from mmmgpu.adaptation_folds import METHODS
 from mmmgpu.alignments import Alignment, cover, read_alignment, write_textgrid
@@ -126,16 +126,7 @@ def test_an_interrupted_adaptation_continues_to_the_same_bytes(
     two_persons, before, adapted, tmp_path, monkeypatch
 ):
     out = tmp_path / "again.mmm"
-    share_out = mmmgpu.corpus_steps.share_out
-    calls = []
-
-    def once(*args, **options):
-        calls.append(args[2])
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        share_out(*args, **options)
-
-    monkeypatch.setattr(mmmgpu.corpus_steps, "share_out", once)
+    calls = interrupt_second_step(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         take_style(two_persons, before, out)
     take_style(two_persons, before, out)

@@ -31,7 +31,7 @@ def test_alpha_leaves_the_reference_out(basis):
 
 
 def test_a_cut_is_the_same_model_in_a_smaller_region(basis):
-    part = cut(basis, 5, 8, 45, 40)
+    part = cut(basis, (slice(8, 40), slice(5, 45)))
     x, y, _, _ = basis.region.box
     assert part.region.box == (x + 5, y + 8, 40, 32)
     assert part.region.mouth == basis.region.mouth

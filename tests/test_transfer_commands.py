@@ -100,8 +100,10 @@ def test_the_other_commands_work_on_the_results(mmmgpu, two_persons, made, tmp_p
     ended = mmmgpu(
         *("evaluate", made / name, clip, "--alignments", second.alignments, "--pictures"),
         *("--landmarks", second.alignments, "--json", tmp_path / "e.json"),
+        *("--report", tmp_path / "e.html"),
     )
     assert ended.status == 0
+    assert "Errors" in (tmp_path / "e.html").read_text()
     found = json.loads((tmp_path / "e.json").read_text())
     others = {"map", "mllr", "shift"} if name == "a.mmm" else set()
     assert set(found["alpha"]["all"]["rms"]) == {"pooled", "trained"} | others

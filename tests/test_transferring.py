@@ -4,8 +4,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from pairs import interrupt_second_step
 
-import mmmgpu.corpus_steps
 from mmmgpu.alignments import read_alignment
 from mmmgpu.correspondence import rbf_correspondence
 from mmmgpu.errors import InputError
@@ -145,16 +145,7 @@ def test_an_interrupted_transfer_continues_to_the_same_bytes(
     two_persons, moved, tmp_path, monkeypatch
 ):
     out = tmp_path / "again.mmm"
-    share_out = mmmgpu.corpus_steps.share_out
-    calls = []
-
-    def once(*args, **options):
-        calls.append(args[2])
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        share_out(*args, **options)
-
-    monkeypatch.setattr(mmmgpu.corpus_steps, "share_out", once)
+    calls = interrupt_second_step(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         move(two_persons, out)
     assert not out.exists()

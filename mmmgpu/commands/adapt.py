@@ -12,6 +12,7 @@ from mmmgpu.commands.options import (
     Json,
     LibraryDefault,
     ModelFile,
+    ModelOut,
     Report,
     Sync,
 )
@@ -26,9 +27,7 @@ def adapt(
     clips: Clips,
     *,
     alignments: Alignments,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="MODEL", help="Model to write, by custom NAME.mmm.")
-    ],
+    out: ModelOut,
     method: Annotated[
         str,
         typer.Option(

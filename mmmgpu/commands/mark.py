@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mmmgpu.commands.endings import say
-from mmmgpu.commands.options import Clips, Json, ModelFile, Sync, parse_box
+from mmmgpu.commands.options import Clips, Json, ModelFile, RegionBox, Sync, parse_box
 from mmmgpu.commands.places import require_output, videos_in, write_results
 
 if TYPE_CHECKING:
@@ -37,14 +37,7 @@ def mark(
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
-    region: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,W,H",
-            help="Mouth and chin in the first frame of the middle clip, in pixels, where they are "
-            "not found by themselves.",
-        ),
-    ] = None,
+    region: RegionBox = None,
     closed: Annotated[
         str | None,
         typer.Option(

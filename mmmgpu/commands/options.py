@@ -59,6 +59,18 @@ Alignments = Annotated[
         "written by: mmmgpu align. For one clip also the file itself.",
     ),
 ]
+ModelOut = Annotated[
+    Path, typer.Option("--out", metavar="MODEL", help="Model to write, by custom NAME.mmm.")
+]
+RegionBox = Annotated[
+    str | None,
+    typer.Option(
+        "--region",
+        metavar="X,Y,W,H",
+        help="Mouth and chin in the first frame of the middle clip, in pixels, where they are "
+        "not found by themselves.",
+    ),
+]
 VideoOut = Annotated[
     Path, typer.Option("--out", metavar="VIDEO", help="Video to write: .mp4, .mov or .mkv.")
 ]

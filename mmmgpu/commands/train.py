@@ -1,6 +1,5 @@
 """``mmmgpu train``: clips and their alignments -> a model."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,6 +10,8 @@ from mmmgpu.commands.options import (
     Clips,
     Json,
     LibraryDefault,
+    ModelOut,
+    RegionBox,
     Report,
     Sync,
     parse_box,
@@ -25,9 +26,7 @@ def train(
     clips: Clips,
     *,
     alignments: Alignments,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="MODEL", help="Model to write, by custom NAME.mmm.")
-    ],
+    out: ModelOut,
     prototypes: Annotated[
         int,
         typer.Option(
@@ -36,14 +35,7 @@ def train(
             default_factory=LibraryDefault(*_OPTIONS, "prototypes"),
         ),
     ],
-    region: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,W,H",
-            help="Mouth and chin in the first frame of the middle clip, in pixels, where they are "
-            "not found by themselves.",
-        ),
-    ] = None,
+    region: RegionBox = None,
     sync: Sync,
     flow: Annotated[
         str,

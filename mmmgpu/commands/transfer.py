@@ -5,7 +5,16 @@ from typing import Annotated
 
 import typer
 
-from mmmgpu.commands.options import Alignments, Backend, Clips, Json, LibraryDefault, Report, Sync
+from mmmgpu.commands.options import (
+    Alignments,
+    Backend,
+    Clips,
+    Json,
+    LibraryDefault,
+    ModelOut,
+    Report,
+    Sync,
+)
 from mmmgpu.commands.places import require_output, videos_in, write_results
 
 EXAMPLE = (
@@ -30,9 +39,7 @@ def transfer(
             help="Corresponding points of the two faces, written by: mmmgpu mark.",
         ),
     ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="MODEL", help="Model to write, by custom NAME.mmm.")
-    ],
+    out: ModelOut,
     balance: Annotated[
         float,
         typer.Option(
