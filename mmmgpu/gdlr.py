@@ -22,6 +22,10 @@ and eta_g = eta'/L_g with eta' in (0, 1] never ascends. But y is not: where phon
 large variance meet, smoothing passes more on than it gets, and E curves by up to c_j L_g in
 dimension j. So the step is eta'/(max(c_j, 1) L_g), with c_j from a few power iterations.
 
+xi mixes the pure number 1 with coordinates of some scale: where they are small against 1, descent
+moves the bias and hardly anything else. With these steps the coordinates are measured in the
+stream's own units, (mu - m)/s (`standard_units`), in which Eq. 15 is the same.
+
 Source: CE05 = Chang & Ezzat, "Transferable Videorealistic Speech Animation" (SCA 2005), 5.3.
 """
 
@@ -36,6 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.errors import InputError
+from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.trajectories import System
 
 Array = NDArray[np.float64]
@@ -58,8 +63,22 @@ def paper_steps(_: System, mean: Array, class_of: Rows) -> Array:
     return np.ones((class_of.max() + 1, mean.shape[1]))
 
 
+def standard_units(models: PhonemeModels) -> tuple[Array, float]:
+    """m (d,), the mean of all frames, and s, the RMS distance of a frame from its phone's mean."""
+    centre = np.average(models.mean, axis=0, weights=models.count)
+    return centre, float(np.sqrt(models.typical_variance.mean()))
+
+
+def paper_units(models: PhonemeModels) -> tuple[Array, float]:
+    """0 and 1: the coordinates as they are, as in the paper."""
+    return np.zeros(models.mean.shape[1]), 1.0
+
+
 RULES: Final[MappingProxyType[str, Callable[[System, Array, Rows], Array]]] = MappingProxyType(
     {"bounded": bounded_steps, "paper": paper_steps}
+)
+UNITS: Final[MappingProxyType[str, Callable[[PhonemeModels], tuple[Array, float]]]] = (
+    MappingProxyType({"bounded": standard_units, "paper": paper_units})
 )
 RATES: Final = MappingProxyType({"bounded": (0.1, 0.3, 1.0), "paper": (0.005,)})
 

@@ -13,6 +13,8 @@ to it (Eq. 8); the same beta_k of B's candidates, warped along C_syn,k, is what 
     P_k** = argmin_n  sum_p w_t(p) |I_syn,k(p) - I_n(p)|.
 
 A candidate changes what the others are made of: all are chosen again, until nothing changes.
+Both pictures of Eq. 10 are smoothed first: flows are good to a fraction of a pixel, and where the
+edges of teeth and lips are sharper than that, they would count as different textures.
 """
 
 from collections.abc import Sequence
@@ -37,6 +39,7 @@ Numbers = NDArray[np.int64]
 
 BALANCE = 0.5  # t of the paper
 MOST_ITERATIONS = 30
+SMOOTHED = 0.02  # of the mouth's width: deviation of the Gaussian that smooths textures
 
 
 @dataclass(frozen=True)
@@ -241,7 +244,7 @@ class _TextureScan:
         self._kernels, self._one = get_backend(backend), get_backend(backend, 1)
         self._pixels = np.flatnonzero(target.w_t > MOUTH)
         weight = target.w_t.ravel()[self._pixels]
-        frames = target.images.reshape(len(target.images), -1, 3).take(self._pixels, axis=1)
+        frames = np.stack([self._seen(image) for image in target.images])
         self._frames, self._weight = map(self._kernels.to_device, (frames, weight / weight.sum()))
         self._made: dict[int, tuple[bytes, F32]] = {}
 
@@ -252,6 +255,11 @@ class _TextureScan:
         queries = self._kernels.to_device(np.stack(made))
         scanned = self._kernels.distance_scan(queries, self._frames, self._weight)
         return np.asarray(self._kernels.to_host(scanned), np.float64)
+
+    def _seen(self, image: F32) -> F32:
+        """`image` (h', w', 3), smoothed, at the pixels that count, (P, 3)."""
+        smooth = cv2.GaussianBlur(image, (0, 0), SMOOTHED * self._target.region.mouth[2])
+        return np.asarray(smooth.reshape(-1, 3)[self._pixels], np.float32)
 
     def _synthesis(self, item: tuple[int, Numbers], _: Any) -> F32:
         """I_syn,k at the pixels that count, (P, 3)."""
@@ -265,7 +273,6 @@ class _TextureScan:
         basis = replace(self._target, images=self._target.images[frames], flows=flows)
         every = np.arange(len(used))
         warped = self._one.to_host(warp_prototypes(basis, self._flows[k], every, self._one))
-        at = warped.reshape(len(used), -1, 3)[:, self._pixels]
-        made = np.tensordot(self._beta[used, k].astype(np.float32), at, axes=1)
+        made = self._seen(np.tensordot(self._beta[used, k].astype(np.float32), warped, axes=1))
         self._made[k] = (frames.tobytes(), made)
         return made

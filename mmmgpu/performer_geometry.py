@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mmmgpu.performer_traits import Field, Shape
 
 Array = Field
+_LOWER_FACE = 0.468  # from the base of the nose to the chin: of the face the lengths below are for
 _JAW_DROP = 0.125  # of the chin, jaw wide open
 _SOFT = 0.005  # how far soft lips part before a slit shows
 _FIXED = -0.125  # upper end of the moving skin, from the lips' seam
@@ -63,23 +64,27 @@ class Pucker:
 
 
 def pucker(shape: Shape, a: dict[str, float]) -> Pucker:
-    """Mouth geometry of one frame from its articulators (see `performer_articulation`)."""
-    drop = _JAW_DROP * a["jaw"]
+    """Mouth geometry of one frame from its articulators (see `performer_articulation`).
+
+    Movements are in proportion: sideways to the mouth's width, up and down to the lower face.
+    """
+    size = (shape.chin - shape.nose_base) / _LOWER_FACE
+    drop = _JAW_DROP * size * a["jaw"]
     spread = 2 * a["width"] - 1
-    upper = -0.030 * a["upper_lip"] + 0.06 * drop + 0.010 * a["round"]
-    gap = 0.90 * drop + 0.042 * a["lower_lip"] + 0.030 * a["upper_lip"]
+    upper = size * (0.010 * a["round"] - 0.030 * a["upper_lip"]) + 0.06 * drop
+    gap = 0.90 * drop + size * (0.042 * a["lower_lip"] + 0.030 * a["upper_lip"])
     closed = float(np.clip((a["press"] - 0.35) / 0.45, 0, 1))
     closed *= closed * (3 - 2 * closed)
     upper += (0.22 * drop - upper) * closed
     gap *= 1 - closed
     gap = max(gap - _SOFT, 0.0)
-    upper += (-0.016 - upper) * a["bite"]
-    gap += (0.029 - gap) * a["bite"]
+    upper += (-0.016 * size - upper) * a["bite"]
+    gap += (0.029 * size - gap) * a["bite"]
     return Pucker(
         half_width=shape.mouth_width * (1 + 0.19 * spread) * (1 - 0.27 * a["round"]),
         upper=upper,
         lower=upper + gap,
-        corner=0.30 * drop - 0.016 * spread,
+        corner=0.30 * drop - 0.016 * size * spread,
         drop=drop,
         thin_upper=1 - 0.38 * a["press"] - 0.10 * max(spread, 0) + 0.12 * a["round"],
         thin_lower=(1 - 0.34 * a["press"] - 0.14 * max(spread, 0) + 0.10 * a["round"])

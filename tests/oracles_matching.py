@@ -2,9 +2,10 @@
 
 import numpy as np
 import oracles_model
+from scipy.ndimage import gaussian_filter
 from scipy.optimize import fsolve
 
-from mmmgpu.matching import LIP, MOUTH
+from mmmgpu.matching import LIP, MOUTH, SMOOTHED
 
 
 def flow_distance(source, view, k, n):
@@ -48,14 +49,23 @@ def texture_coordinates(source, view, k):
 
 
 def texture_distance(target, view, beta, candidates, flow, n):
-    """Eq. 9-10 of one prototype, beta (M,), C_syn `flow`, and frame n, over the sum of weights."""
+    """Eq. 9-10 of one prototype, beta (M,), C_syn `flow`, and frame n, over the sum of weights.
+
+    Of both pictures smoothed, with the picture mirrored about its edge pixels outside.
+    """
     made = np.zeros(target.images[0].shape)
     for b, frame in zip(beta, candidates, strict=True):
         if b > 0:
             made += b * _moved(target.images[frame], view.flows_b[frame], flow)
+    difference = gaussian_filter(
+        made - target.images[n],
+        (SMOOTHED * target.region.mouth[2],) * 2,
+        axes=(0, 1),
+        mode="mirror",
+    )
     total = weights = 0.0
     for y, x in np.argwhere(target.w_t > MOUTH):
-        miss = made[y, x] - target.images[n][y, x]
+        miss = difference[y, x]
         total += target.w_t[y, x] * np.sqrt((miss**2).sum())
         weights += target.w_t[y, x]
     return total / weights

@@ -15,6 +15,7 @@ from mmmgpu.gdlr import (
     gain,
     identity_regressions,
     regressed,
+    standard_units,
 )
 from mmmgpu.phonemes import PhonemeModels, Utterance
 from mmmgpu.trajectories import factor_system, lay_out_utterances
@@ -260,6 +261,14 @@ def test_a_phone_without_frames_moves_with_its_class_and_a_class_without_frames_
     moved = descend(system, models.mean, z, class_of=class_of)[-1]
     assert abs(moved[2] - models.mean[2]).max() > 1e-2
     np.testing.assert_array_equal(moved[3], models.mean[3])
+
+
+def test_standard_units_are_where_frames_lie_and_how_far_from_their_phones():
+    mean, variance = np.array([[0.0, 1.0], [3.0, 1.0]]), np.array([[1.0, 4.0], [4.0, 7.0]])
+    models = PhonemeModels(("a", "b"), mean, variance, np.array([2, 1]))
+    centre, unit = standard_units(models)
+    np.testing.assert_allclose(centre, [1, 1], rtol=1e-12)
+    np.testing.assert_allclose(unit**2, (2 * (1 + 4) + 4 + 7) / 6, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
