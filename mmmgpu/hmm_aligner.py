@@ -27,7 +27,7 @@ from mmmgpu.phone_networks import BREATH, PAUSE, Network, unroll
 from mmmgpu.phones import SIL
 from mmmgpu.sounds import checked_speech
 
-LARGEST: Final = 30_000_000  # frames times states of one clip; each takes some 40 bytes
+LARGEST: Final = 20_000_000  # frames times states of one clip; each takes some 50 bytes
 _STEP: Final = "training"  # of the checkpoints
 
 
@@ -108,7 +108,7 @@ def train_hmms(
     spoken = {p for r in recordings for _, said in r.words for phones in said for p in phones}
     labels = sorted(spoken | {SIL} | ({BREATH} if breath else set()))
     hmms = flat_start(labels, [r.features for r in recordings])
-    utterances = [Utterance(r.features, network_of(hmms, r)) for r in recordings]
+    utterances = [Utterance(r.features, _network(hmms, r)) for r in recordings]
     trained = Trained(hmms, ()) if folder is None else _read(folder, hmms)
     done = len(trained.log_likelihoods)
     advance(done * len(recordings))
@@ -119,18 +119,12 @@ def train_hmms(
     return trained
 
 
-def network_of(hmms: PhoneHmms, recording: Recording) -> Network:
-    """Return all ways to say the words of `recording`, with breaths where `hmms` have them."""
-    words = [said for _, said in recording.words]
-    return unroll(words, hmms.states, breath=BREATH in hmms.states)
-
-
 def align(hmms: PhoneHmms, recording: Recording) -> Alignment:
     """Return when the words and phones of `recording` are said, by the most likely way (Viterbi).
 
     Boundaries lie between frames, `SHIFT` apart. Phones cover the clip.
     """
-    network = network_of(hmms, recording)
+    network = _network(hmms, recording)
     with one_thread_each():
         log_b = log_densities(hmms, network, recording.features)
     path = viterbi(network, hmms.stay[network.state], log_b)
@@ -142,6 +136,12 @@ def align(hmms: PhoneHmms, recording: Recording) -> Alignment:
         Segment(recording.words[w][0], times[a], times[b]) for w, a, b in _runs(word) if w != PAUSE
     ]
     return Alignment(cover(phones, recording.duration), tuple(words), recording.duration)
+
+
+def _network(hmms: PhoneHmms, recording: Recording) -> Network:
+    """Return all ways to say the words of `recording`, with breaths where `hmms` have them."""
+    words = [said for _, said in recording.words]
+    return unroll(words, hmms.states, breath=BREATH in hmms.states)
 
 
 def _runs(names: NDArray[np.int64]) -> list[tuple[int, int, int]]:

@@ -54,7 +54,6 @@ class Network:
         probabilities are those of the one move among all that leave a state.
     log_start: log probability of beginning with each state, (S,).
     log_end: that of ending when leaving it, (S,).
-    fewest_frames: the length of the shortest way through.
     """
 
     units: tuple[Unit, ...]
@@ -64,7 +63,6 @@ class Network:
     departures: Moves
     log_start: NDArray[np.float64]
     log_end: NDArray[np.float64]
-    fewest_frames: int
 
 
 def unroll(
@@ -106,7 +104,6 @@ def unroll(
         departures=_moves(moves, n),
         log_start=log_start,
         log_end=log_end,
-        fewest_frames=_fewest_frames(units, length, last),
     )
 
 
@@ -145,10 +142,3 @@ def _moves(moves: Iterable[tuple[int, int, float]], n: int) -> Moves:
     width = max(1, *map(len, table))
     padded = np.array([row + [(n, 0.0)] * (width - len(row)) for row in table])
     return Moves(padded[..., 0].T.astype(np.int64), padded[..., 1].T.copy())
-
-
-def _fewest_frames(units: Sequence[Unit], length: Sequence[int], last: Iterable[int]) -> int:
-    fewest = {_EDGE: 0}
-    for u, unit in enumerate(units):
-        fewest[u] = length[u] + min(fewest[before] for before in unit.after)
-    return min(fewest[u] for u in last)

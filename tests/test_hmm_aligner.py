@@ -9,7 +9,7 @@ from hmms import LEXICON, RATE, SENTENCES, utter
 from mmmgpu import hmm_aligner, hmm_training
 from mmmgpu.alignments import read_alignment
 from mmmgpu.errors import InputError
-from mmmgpu.hmm_aligner import align, make_recording, network_of, train_hmms
+from mmmgpu.hmm_aligner import align, make_recording, train_hmms
 from mmmgpu.lexicons import look_up, read_lexicon
 from mmmgpu.phone_networks import BREATH
 from mmmgpu.phones import SIL
@@ -167,7 +167,7 @@ def test_a_clip_that_cannot_be_learned_from(lexicon, seconds, text, message):
 def test_the_shortest_possible_clip_is_aligned(lexicon, trained):
     samples, _ = utter("mása", np.random.default_rng(3))
     recording = make_recording(samples[: round(0.12 * RATE)], RATE, look_up("mása", lexicon, ""))
-    assert network_of(trained.hmms, recording).fewest_frames == len(recording.features)
+    assert len(recording.features) == 4 * hmm_training.STATES
     assert len(spoken(align(trained.hmms, recording))) == 4
 
 
@@ -182,7 +182,7 @@ def test_a_clip_that_needs_too_much_memory_is_refused(lexicon, monkeypatch):
 
 @pytest.mark.real
 def test_word_boundaries_of_real_speech():
-    """Every third clip of GRID speaker 1; the bound for all 175 is 30 ms (docs/alignment.md)."""
+    """44 of the 175 clips of GRID speaker 1, learned from these alone; see docs/alignment.md."""
     folder = os.environ.get("MMMGPU_DATA")
     if not folder:
         pytest.skip("MMMGPU_DATA names no folder of real video")
@@ -197,5 +197,5 @@ def test_word_boundaries_of_real_speech():
         theirs = read_alignment(clip.with_suffix(".align")).words
         pairs = zip(align(hmms, recording).words, theirs, strict=True)
         errors += [np.subtract(a[1:], b[1:]) for a, b in pairs]
-    print(np.median(np.abs(errors)), np.percentile(np.abs(errors), 90))
     assert np.median(np.abs(errors)) <= 0.03
+    assert np.percentile(np.abs(errors), 90) <= 0.08

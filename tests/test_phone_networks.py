@@ -73,11 +73,3 @@ def test_arrivals_and_departures_are_the_same_moves_and_go_forward(words):
 
     assert {(a, b, p) for b, a, p in moves(network.arrivals)} == moves(network.departures)
     assert all(a < b for a, b, _ in moves(network.departures))
-
-
-@pytest.mark.parametrize(
-    ("words", "frames"), [(WORDS["one"], 4), (WORDS["two"], 7), (WORDS["choices"], 4)]
-)
-def test_the_shortest_way(words, frames):
-    assert unroll(words, STATES, breath=False).fewest_frames == frames
-    assert unroll(words, STATES, breath=True).fewest_frames == frames
