@@ -61,7 +61,8 @@ def align(
         ),
     ] = None,
     breath: Annotated[
-        bool, typer.Option(help="With --aligner hmm: look for breaths (BR) in the pauses.")
+        bool,
+        typer.Option("--breath", help="With --aligner hmm: look for breaths (BR) in the pauses."),
     ] = False,
     json: Json = None,
 ) -> None:
