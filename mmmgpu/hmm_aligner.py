@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from mmmgpu.alignments import Alignment, Segment, cover
 from mmmgpu.checkpoints import read_step, write_step
 from mmmgpu.errors import InputError
-from mmmgpu.hmm_training import STATES, Utterance, flat_start, train
+from mmmgpu.hmm_training import BREATH_STATES, STATES, Utterance, flat_start, train
 from mmmgpu.lexicons import Spoken
 from mmmgpu.mfcc import SHIFT, mfcc
 from mmmgpu.parallel import one_thread_each
@@ -78,7 +78,8 @@ def make_recording(samples: ArrayLike, rate: int, words: Sequence[Spoken]) -> Re
             f"the transcript ({len(words)} words) takes at least {fewest * SHIFT:.2f} s to say but "
             f"the sound lasts {duration:.2f} s; give the words that are said in this clip"
         )
-    most = STATES * sum(3 + sum(map(len, said)) for _, said in words)
+    pauses = (len(words) + 1) * (2 * STATES + BREATH_STATES)
+    most = STATES * sum(sum(map(len, said)) for _, said in words) + pauses
     if len(features) * most > LARGEST:
         raise InputError(
             f"the clip ({duration:.0f} s, {len(words)} words) is too long to be aligned in one "

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phone_hmms import PhoneHmms, forward_backward, log_components
-from mmmgpu.phone_networks import Network
+from mmmgpu.phone_networks import BREATH, Network
 from mmmgpu.phones import SIL
 
 Array = NDArray[np.float64]
 
-STATES: Final = 3  # of a phone, of silence, of a breath
+STATES: Final = 3  # of a phone, and of silence
+BREATH_STATES: Final = 10  # no breath is shorter than so many frames; what is, is a closed mouth
 ROUNDS: Final = (8, 4, 4)  # of Baum-Welch, with 1, 2 and 4 Gaussians a state
 FIRST_STAY: Final = 0.6  # a phone of 75 ms
 STAY_RANGE: Final = (0.05, 0.99)
@@ -72,11 +73,12 @@ def flat_start(labels: Sequence[str], features: Sequence[Array]) -> PhoneHmms:
         features: (T, D) of every clip.
     """
     x = np.concatenate(features)
-    bounds = pairwise(accumulate([STATES] * len(labels), initial=0))
+    lengths = [BREATH_STATES if label == BREATH else STATES for label in labels]
+    bounds = pairwise(accumulate(lengths, initial=0))
     states = {label: range(*ends) for label, ends in zip(labels, bounds, strict=True)}
     quiet = _is_quiet(x[:, 0])
-    means = np.tile(x[~quiet].mean(axis=0), (STATES * len(labels), 1, 1))
-    variances = np.tile(x[~quiet].var(axis=0), (STATES * len(labels), 1, 1))
+    means = np.tile(x[~quiet].mean(axis=0), (sum(lengths), 1, 1))
+    variances = np.tile(x[~quiet].var(axis=0), (sum(lengths), 1, 1))
     if quiet.any():
         means[states[SIL]] = x[quiet].mean(axis=0)
         variances[states[SIL]] = x[quiet].var(axis=0)
