@@ -64,10 +64,10 @@ def test_bits_repeat_and_samples_stay():
     assert first.dtype == np.float64
 
 
-def test_digital_silence_is_finite():
+def test_digital_silence_is_no_abyss():
     samples = tones(RATE)
     samples[:4000] = 0
-    assert np.isfinite(mfcc(samples, RATE)).all()
+    assert np.ptp(mfcc(samples, RATE)[:, 0]) < 100  # without noise: 177
 
 
 @pytest.mark.parametrize(
