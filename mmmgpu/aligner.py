@@ -15,11 +15,11 @@ from mmmgpu.alignments import Alignment, Segment, cover
 from mmmgpu.errors import InputError
 from mmmgpu.phones import SIL, normalise_label
 from mmmgpu.pronunciation import dictionary, pronounce, spoken_words
+from mmmgpu.sounds import checked_speech, levelled
 
 MODEL_RATE: Final = 16_000  # Hz
 FRAME: Final = 0.01  # s, between frames of the acoustic model
 WINDOW: Final = 0.025625  # s, of sound that a frame sees
-PEAK: Final = 0.5  # of full scale, to which every clip is brought
 POOREST_SCORE: Final = -36.0  # a frame of speech, see align_speech
 LEAST_SHARE: Final = 0.5  # of the sound's energy above low frequencies, within the words
 
@@ -74,13 +74,13 @@ def align_speech(samples: ArrayLike, rate: int, transcript: str) -> Alignment:
     Raises:
         InputError: No sound, no words, a transcript that does not fit, or no pocketsphinx.
     """
-    sound = _checked_sound(samples, rate)
+    sound = checked_speech(samples, rate)
     words = spoken_words(transcript)
     if not words:
         raise InputError(f"the transcript {transcript[:40]!r} has no words; give what is said")
     pronunciations = {word: pronounce(word) for word in words if word not in dictionary()}
     duration = len(sound) / rate
-    at_model_rate = _at_model_rate(sound, rate)
+    at_model_rate = levelled(sound, rate, MODEL_RATE)
     for attempt in _ATTEMPTS:
         found = _search(at_model_rate, words, pronunciations, attempt)
         if found and _mean_score(found) >= POOREST_SCORE:
@@ -91,28 +91,6 @@ def align_speech(samples: ArrayLike, rate: int, transcript: str) -> Alignment:
         f"the transcript {transcript[:40]!r} does not match the sound ({duration:.1f} s); "
         "give the words that are said in this clip"
     )
-
-
-def _checked_sound(samples: ArrayLike, rate: int) -> NDArray[np.float64]:
-    sound = np.asarray(samples, dtype=np.float64)
-    if sound.ndim != 1 or not sound.size:
-        raise InputError(f"samples must be mono, shape (N,), N > 0, got {sound.shape}")
-    if not np.isfinite(sound).all():
-        raise InputError("samples must be finite; there is NaN or infinity in the sound")
-    if rate <= 0:
-        raise InputError(f"rate must be > 0 samples a second, got {rate}")
-    return sound
-
-
-def _at_model_rate(sound: NDArray[np.float64], rate: int) -> NDArray[np.float64]:
-    """Return `sound` at MODEL_RATE and PEAK."""
-    from mmmgpu.sounds import resample
-
-    samples = resample(sound.astype(np.float32), rate, MODEL_RATE).astype(np.float64)
-    peak: float = np.abs(samples).max(initial=0.0)
-    if not peak:
-        raise InputError("the sound is silent or too short; give a clip with speech")
-    return samples * (PEAK / peak)
 
 
 def _search(

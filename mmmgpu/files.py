@@ -114,6 +114,20 @@ def require_folder(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Return the text in the UTF-8 file `path`.
+
+    Raises:
+        InputError: There is none.
+    """
+    try:
+        return Path(path).read_text("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text in UTF-8; convert it") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+
+
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
     """Write `data` to `path`, whole or not at all."""
     with atomic_path(path) as temporary:

@@ -9,12 +9,11 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
 from mmmgpu.errors import InputError
-from mmmgpu.phones import normalise_label
+from mmmgpu.lexicons import Lexicon, Spoken, read_lexicon
 
 LONGEST_ACRONYM: Final = 5  # letters; longer words in capitals are shouted, not spelled
 _SYMBOLS: Final = {
@@ -174,17 +173,27 @@ def dictionary() -> Mapping[str, tuple[str, ...]]:
     Raises:
         InputError: pocketsphinx, whose wheel carries it, is not installed.
     """
+    return MappingProxyType({word: first for word, (first, *_) in _cmudict().items()})
+
+
+@lru_cache(maxsize=1)
+def _cmudict() -> Lexicon:
     try:
         import pocketsphinx
     except ImportError as error:
         raise InputError(
             "pronunciations need pocketsphinx's dictionary; run pip install 'mmmgpu[align]'"
         ) from error
-    path = Path(pocketsphinx.get_model_path("en-us/cmudict-en-us.dict"))
-    entries = (line.split() for line in path.read_text(encoding="utf-8").splitlines())
-    return MappingProxyType(
-        {word: tuple(map(normalise_label, phones)) for word, *phones in entries if word[-1] != ")"}
-    )
+    return read_lexicon(pocketsphinx.get_model_path("en-us/cmudict-en-us.dict"))
+
+
+def look_up_english(text: str) -> list[Spoken]:
+    """Return the words of `text` (see `spoken_words`) with all pronunciations that CMUdict has.
+
+    Of a word that it has not, the one of `pronounce`.
+    """
+    known = _cmudict()
+    return [(w, known.get(_plain(w)) or (pronounce(w),)) for w in spoken_words(text)]
 
 
 @lru_cache(maxsize=10_000)

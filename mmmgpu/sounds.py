@@ -7,17 +7,18 @@ is put in where the sound starts later.
 import os
 import wave
 from fractions import Fraction
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from av.audio.frame import AudioFrame
 from av.audio.resampler import AudioResampler
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 from .files import atomic_path
 from .videos import VideoInfo, open_media, picture_start
 
+PEAK: Final = 0.5  # of full scale, to which speech is brought before it is analysed
 _GAP_S = 0.05  # timestamps that leave a gap longer than this are believed, and filled with silence
 _LONGEST_GAP_S = 60.0  # more is a broken clock
 _LIMIT_S = 0.5  # sound and picture may differ in length by this much
@@ -108,6 +109,35 @@ def resample(samples: NDArray[np.float32], rate: int, new_rate: int) -> NDArray[
     parts = [f.to_ndarray()[0] for f in resampler.resample(frame) + resampler.resample(None)]
     result = np.concatenate(parts)[:length]
     return np.pad(result, (0, length - len(result)))
+
+
+def checked_speech(samples: ArrayLike, rate: int) -> NDArray[np.float64]:
+    """Return mono `samples` as float64, shape (N,).
+
+    Raises:
+        InputError: They are none, not mono or not finite, or `rate` [Hz] is no rate.
+    """
+    sound = np.asarray(samples, dtype=np.float64)
+    if sound.ndim != 1 or not sound.size:
+        raise InputError(f"samples must be mono, shape (N,), N > 0, got {sound.shape}")
+    if not np.isfinite(sound).all():
+        raise InputError("samples must be finite; there is NaN or infinity in the sound")
+    if rate <= 0:
+        raise InputError(f"rate must be > 0 samples a second, got {rate}")
+    return sound
+
+
+def levelled(sound: NDArray[np.float64], rate: int, new_rate: int) -> NDArray[np.float64]:
+    """Return mono `sound`, (N,), resampled from `rate` to `new_rate` [Hz], the loudest at `PEAK`.
+
+    Raises:
+        InputError: There is nothing to be heard.
+    """
+    samples = resample(sound.astype(np.float32), rate, new_rate).astype(np.float64)
+    peak: float = np.abs(samples).max(initial=0.0)
+    if not peak:
+        raise InputError("the sound is silent or too short; give a clip with speech")
+    return samples * (PEAK / peak)
 
 
 def check_sync(info: VideoInfo, sound: tuple[NDArray[np.float32], int]) -> None:

@@ -14,6 +14,7 @@ import sys
 import time
 from fractions import Fraction
 
+import hmms
 import numpy as np
 import pytest
 from commands import assert_refused, run_command, trained_model
@@ -245,6 +246,75 @@ def test_bad_transcripts(mmmgpu, recording, world, tmp_path, out, content, words
     clips = (recording, world.clips[0])
     ended = mmmgpu("align", *clips, "--transcripts", place, "--out", out)
     assert_refused(ended, place, words)
+
+
+@pytest.fixture
+def by_hmms(mmmgpu, tmp_path, out):
+    """Align a good clip of a made-up language and another, NAME.*, with its transcript."""
+    samples, _ = hmms.utter("mása so", np.random.default_rng(0))
+    (tmp_path / "words.dict").write_text(hmms.LEXICON, encoding="utf-8")
+    sounds = {"good": samples, "short": samples[:1600], "silent": np.zeros(16000)}
+    for name, sound in sounds.items():
+        write_wav(tmp_path / f"{name}.wav", sound, hmms.RATE)
+        (tmp_path / f"{name}.txt").write_text("mása so", encoding="utf-8")
+
+    def run(clip, text=None, *, dictionary="words.dict"):
+        clip = tmp_path / clip
+        if text is not None:
+            clip.with_suffix(".txt").write_text(text, encoding="utf-8")
+        args = ("--transcripts", tmp_path, "--dictionary", tmp_path / dictionary)
+        clips = (tmp_path / "good.wav", clip)
+        return mmmgpu("align", *clips, *args, "--out", out, "--aligner", "hmm")
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("clip", "text", "words"),
+    [
+        ("silent.mkv", "so", "has no sound; give a file with sound"),
+        ("silent.wav", None, "the sound is silent"),
+        (
+            "short.wav",
+            None,
+            "takes at least 0.18 s to say but the sound lasts 0.10 s; give the words",
+        ),
+        ("short.wav", " ...\n", "the transcript has no words; give what is said"),
+        ("short.wav", "so, ugo", "'ugo' is not in the dictionary {}; add it there"),
+    ],
+)
+def test_one_bad_clip_among_those_to_learn_from(by_hmms, clip, text, words, tmp_path, out, frames):
+    encode(tmp_path / "silent.mkv", frames)
+    ended = by_hmms(clip, text)
+    assert ended.status == 1
+    (line,) = [line for line in ended.err.splitlines() if "error: " in line]
+    assert line.startswith(f"mmmgpu: error: {tmp_path / clip}: ")
+    assert words.format(tmp_path / "words.dict") in line
+    assert [p.name for p in out.iterdir()] == ["good.TextGrid"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "cannot be read"),
+        (b"so s o\nso\n", "a.dict:2: expected 'word PHONE PHONE ...'"),
+        (b"\xff\xfe\x00\xd8", "UTF-8"),
+        (b"", "holds no word"),
+    ],
+)
+def test_bad_dictionary(by_hmms, tmp_path, out, content, words):
+    if content is not None:
+        (tmp_path / "a.dict").write_bytes(content)
+    assert_refused(by_hmms("short.wav", dictionary="a.dict"), tmp_path / "a.dict", words)
+    assert list(out.iterdir()) == []
+
+
+def test_no_clip_to_learn_from(by_hmms, tmp_path, out):
+    (tmp_path / "good.txt").write_text("")
+    ended = by_hmms("short.wav")
+    assert (ended.status, ended.out) == (1, "")
+    assert ended.err.count("mmmgpu: error: ") == 2
+    assert list(out.iterdir()) == []
 
 
 def retold(model, path, *, header=str, tensor="w_f", change=np.copy):

@@ -4,17 +4,20 @@ import json
 import subprocess
 import sys
 
+import hmms
 import numpy as np
 import pytest
 from commands import run_command, trained_model
 from media import encode, still
 
-from mmmgpu import __version__
+from mmmgpu import __version__, hmm_aligner
+from mmmgpu.alignments import read_alignment
 from mmmgpu.commands import endings
 from mmmgpu.commands.options import LibraryDefault
 from mmmgpu.errors import InputError
+from mmmgpu.hmm_training import ROUNDS
 from mmmgpu.model_files import load
-from mmmgpu.sounds import read_sound, write_wav
+from mmmgpu.sounds import read_sound, resample, write_wav
 from mmmgpu.training import Options
 from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
@@ -79,6 +82,9 @@ def test_starting_loads_no_slow_library():
         ("speak", "m.mmm", "--out", "a.mp4", "--text", "hello", "--audio", "a.wav"),
         ("speak", "m.mmm", "--out", "a.mp4", "--from-trajectory", "t", "--articulation", "1.2"),
         ("reconstruct", "m.mmm", "a.mp4", "--out", "b.mkv", "--landmarks", "."),
+        ("align", "a.mp4", "--transcripts", ".", "--out", "b", "--aligner", "ear"),
+        ("align", "a.mp4", "--transcripts", ".", "--out", "b", "--dictionary", "d"),
+        ("align", "a.mp4", "--transcripts", ".", "--out", "b", "--breath"),
     ],
 )
 def test_wrong_usage_is_status_2(mmmgpu, args, tmp_path, monkeypatch):
@@ -97,7 +103,7 @@ def test_info_of_the_machine(mmmgpu, tmp_path):
     assert facts["backends"]["warp"]["loads"]
     assert "warp:cpu" in facts["backends"]["warp"]["devices"]
     assert facts["packages"][""]["numpy"] == np.__version__
-    assert facts["packages"]["align"].keys() == {"pocketsphinx"}
+    assert facts["packages"]["align"].keys() == {"kaldi-native-fbank", "pocketsphinx"}
     assert "warp:cpu" in ended.out
 
 
@@ -288,6 +294,72 @@ def test_align_one_clip_with_its_text(mmmgpu, voices, tmp_path):
     args = ("--transcripts", voices / "one.txt", "--out", tmp_path)
     assert mmmgpu("align", voices / "one.wav", *args).status == 0
     assert (tmp_path / "one.TextGrid").is_file()
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory):
+    """Recordings of a made-up language in odd formats, with transcripts and a dictionary."""
+    folder = tmp_path_factory.mktemp("foreign")
+    (folder / "words.dict").write_text(hmms.LEXICON, encoding="utf-8")
+    rng, truth = np.random.default_rng(0), {}
+    formats = zip(hmms.SENTENCES, (8000, 16000, 22050, 44100, 48000, 96000), strict=True)
+    for i, (sentence, rate) in enumerate(formats):
+        samples, phones = hmms.utter(sentence, rng)
+        sound = resample(samples.astype(np.float32), hmms.RATE, rate)
+        channels = sound if i % 2 else np.stack([sound, sound], axis=1)
+        name = f"{i} {rate}"
+        write_wav(folder / f"{name}.wav", channels, rate)
+        (folder / f"{name}.txt").write_text(sentence, encoding="utf-8")
+        truth[name] = phones
+    return folder, truth
+
+
+def test_align_by_models_of_the_clips_themselves(mmmgpu, foreign, tmp_path):
+    folder, truth = foreign
+    out, results = tmp_path / "out", tmp_path / "results.json"
+    args = ("--transcripts", folder, "--out", out, "--aligner", "hmm", "--json", results)
+    args = (*args, "--dictionary", folder / "words.dict")
+    clips = sorted(folder.glob("*.wav"))
+    ended = mmmgpu("align", *clips, *args)
+    assert ended.status == 0
+    facts = json.loads(results.read_text())
+    assert [clip["status"] for clip in facts["clips"]] == ["aligned"] * len(clips)
+    assert facts["training"]["phones"] == ["SIL", "a", "i", "m", "o", "s"]
+    assert sorted(p.stem for p in out.iterdir()) == sorted(truth)  # no unfinished training
+    errors = []
+    for name, phones in truth.items():
+        found = [p for p in read_alignment(out / f"{name}.TextGrid").phones if p.label != "SIL"]
+        assert [p.label for p in found] == [label for label, _, _ in phones]
+        errors += [np.subtract(a[1:], b[1:]) for a, b in zip(found, phones, strict=True)]
+    assert np.median(np.abs(errors)) < 0.015
+
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    assert mmmgpu("align", *clips, *args).status == 0
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+def test_align_goes_on_where_its_training_was_killed(mmmgpu, foreign, tmp_path, monkeypatch):
+    folder, _ = foreign
+    args = ("--transcripts", folder, "--dictionary", folder / "words.dict", "--aligner", "hmm")
+    clips = sorted(folder.glob("*.wav"))
+    assert mmmgpu("align", *clips, *args, "--out", tmp_path / "whole").status == 0
+    wrote, out = hmm_aligner.write_step, tmp_path / "out"
+    rounds = []
+
+    def write_five(*step):
+        wrote(*step)
+        rounds.append(step)
+        if len(rounds) == 5:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(hmm_aligner, "write_step", write_five)
+    assert mmmgpu("align", *clips, *args, "--out", out).status == 130
+    assert [p.name for p in out.iterdir()] == ["hmm.work"]
+    assert mmmgpu("align", *clips, *args, "--out", out).status == 0
+    assert len(rounds) == sum(ROUNDS)
+    for path in (tmp_path / "whole").iterdir():
+        assert (out / path.name).read_bytes() == path.read_bytes()
+    assert not (out / "hmm.work").exists()
 
 
 def test_demo_passes_on_what_it_is_told(mmmgpu, tmp_path, monkeypatch):

@@ -5,7 +5,14 @@ import os
 import pytest
 
 from mmmgpu.errors import InputError
-from mmmgpu.files import atomic_path, require_folder, write_bytes, write_json, write_text
+from mmmgpu.files import (
+    atomic_path,
+    read_text,
+    require_folder,
+    write_bytes,
+    write_json,
+    write_text,
+)
 
 
 @pytest.mark.parametrize(
@@ -136,3 +143,13 @@ def test_text_and_json_come_back(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "n", float("nan"))
     assert not (tmp_path / "n").exists()
+
+
+def test_text_is_read_without_its_mark(tmp_path):
+    (tmp_path / "a").write_bytes("\ufeffä b".encode())
+    assert read_text(tmp_path / "a") == "ä b"
+    (tmp_path / "a").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"a: is not text in UTF-8; convert it"):
+        read_text(tmp_path / "a")
+    with pytest.raises(InputError, match=r"b: cannot be read"):
+        read_text(tmp_path / "b")

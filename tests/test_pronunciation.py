@@ -5,7 +5,14 @@ from hypothesis import strategies as st
 from mmmgpu import pronunciation, voices
 from mmmgpu.errors import InputError
 from mmmgpu.phones import CMU_PHONES, SIL
-from mmmgpu.pronunciation import dictionary, from_letters, letter_name, pronounce, spoken_words
+from mmmgpu.pronunciation import (
+    dictionary,
+    from_letters,
+    letter_name,
+    look_up_english,
+    pronounce,
+    spoken_words,
+)
 
 
 @pytest.mark.parametrize(
@@ -139,5 +146,14 @@ def test_what_cannot_be_said_is_named():
 def test_a_missing_extra_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pocketsphinx", None)
     dictionary.cache_clear()
+    pronunciation._cmudict.cache_clear()
     with pytest.raises(InputError, match=r"pip install 'mmmgpu\[align\]'"):
         dictionary()
+
+
+def test_english_words_come_with_all_their_pronunciations():
+    assert look_up_english("Read a glorbo!") == [
+        ("read", (("R", "EH", "D"), ("R", "IY", "D"))),
+        ("a", (("AH",), ("EY",))),
+        ("glorbo", (pronounce("glorbo"),)),
+    ]

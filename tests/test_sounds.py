@@ -7,7 +7,17 @@ from media import clicks, encode, encode_sound, grey_levels, song_with_cover, to
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu.errors import InputError
-from mmmgpu.sounds import check_sync, energy, read_sound, read_wav, resample, write_wav
+from mmmgpu.sounds import (
+    PEAK,
+    check_sync,
+    checked_speech,
+    energy,
+    levelled,
+    read_sound,
+    read_wav,
+    resample,
+    write_wav,
+)
 from mmmgpu.videos import VideoInfo, probe
 
 
@@ -145,3 +155,28 @@ def test_energy_is_the_rms_of_each_frame(fps, n_frames):
         inside = [float(samples[i]) if i < rate else 0.0 for i in range(begin, end)]
         expected.append(np.sqrt(sum(s * s for s in inside) / (end - begin)))
     assert_allclose(energy(samples, rate, n_frames, fps), expected, rtol=1e-6, atol=1e-12)
+
+
+def test_speech_is_brought_to_one_level():
+    sound = 0.01 * np.sin(np.arange(8000) / 10)
+    got = levelled(sound, 8000, 16000)
+    assert len(got) == 16000
+    assert np.abs(got).max() == pytest.approx(PEAK)
+    assert_allclose(got[2000:14000:2], sound[1000:7000] * (PEAK / 0.01), atol=0.01)
+    with pytest.raises(InputError, match="the sound is silent or too short"):
+        levelled(np.zeros(100), 8000, 16000)
+
+
+@pytest.mark.parametrize(
+    ("samples", "rate", "message"),
+    [
+        (np.zeros((5, 2)), 8000, r"samples must be mono, shape \(N,\), N > 0, got \(5, 2\)"),
+        ([], 8000, "samples must be mono"),
+        ([0.0, np.nan], 8000, "NaN or infinity"),
+        ([0.0], 0, "rate must be > 0"),
+    ],
+)
+def test_what_is_no_speech(samples, rate, message):
+    assert_array_equal(checked_speech([0.25, 1], 8000), np.array([0.25, 1.0]))
+    with pytest.raises(InputError, match=message):
+        checked_speech(samples, rate)

@@ -1,8 +1,10 @@
 """``mmmgpu align``: when each phone of a known transcript is said -> TextGrids."""
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -11,8 +13,21 @@ from mmmgpu.commands.options import Clips, Json
 from mmmgpu.commands.places import require_output, videos_in, write_results
 from mmmgpu.commands.summaries import show_table
 from mmmgpu.errors import InputError
+from mmmgpu.files import read_text
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mmmgpu.alignments import Alignment
+    from mmmgpu.lexicons import Spoken
 
 EXAMPLE = "Example: mmmgpu align clips/*.mp4 --transcripts clips --out alignments"
+ALIGNERS = ("pocketsphinx", "hmm")
+WORK = "hmm.work"  # the folder of unfinished training
+
+Transcripts = Mapping[str, tuple[Path, str]]  # the file and the text of each clip, by its name
+Result = dict[str, Any]
 
 
 def align(
@@ -29,42 +44,60 @@ def align(
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Folder for the alignments, NAME.TextGrid.")
     ],
+    aligner: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="pocketsphinx: English, clip by clip, by models that come with it. hmm: any "
+            "language, by models trained on CLIPs and transcripts alone; needs many clips.",
+        ),
+    ] = ALIGNERS[0],
+    dictionary: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="With --aligner hmm: how words are pronounced, in lines 'word PHONE PHONE ...' "
+            "(CMUdict's format); without it the speech is English.",
+        ),
+    ] = None,
+    breath: Annotated[
+        bool,
+        typer.Option("--breath", help="With --aligner hmm: look for breaths (BR) in the pauses."),
+    ] = False,
     json: Json = None,
 ) -> None:
     """Find when each phone of a transcript is said in CLIPs.
 
-    The speech is English; sound files are taken too. Every clip's TextGrid is written as soon as it
-    is known; one that is newer than its clip and transcript is kept, so an interrupted job
-    continues. A clip that cannot be aligned is reported, the others go on, and the status is 1 at
-    the end. Times are those of the sound in the file: give --sync to train.
+    The speech is English unless a dictionary is given; sound files are taken too. Every clip's
+    TextGrid is written as soon as it is known. With pocketsphinx one that is newer than its clip
+    and transcript is kept, so an interrupted job continues; with hmm all are made anew, and an
+    interrupted training continues. A clip that cannot be aligned is reported, the others go on, and
+    the status is 1 at the end. Times are those of the sound in the file: give --sync to train.
     """
+    if aligner not in ALIGNERS:
+        raise typer.BadParameter(f"choose one of {', '.join(ALIGNERS)}", param_hint="--aligner")
+    if aligner != "hmm" and (dictionary is not None or breath):
+        option = "--breath" if breath else "--dictionary"
+        raise typer.BadParameter("is for --aligner hmm", param_hint=option)
     found = videos_in(clips)
     said = read_transcripts(transcripts, found)
-    require_output(out / f"{found[0].stem}.TextGrid", [transcripts, *found])
-    require_output(json, [transcripts, *found])
-    from mmmgpu.progress import progress
-
-    results = []
-    for clip in progress(found, "align clips"):
-        textgrid = out / f"{clip.stem}.TextGrid"
-        try:
-            if clip.stem not in said:
-                raise InputError(f"{transcripts}: holds no transcript of {clip.stem}; add it")
-            result = _align_clip(clip, *said[clip.stem], textgrid)
-        except InputError as error:
-            reason = str(error).removeprefix(f"{clip}: ")
-            say(f"error: {clip}: {reason}")
-            result = {"status": "failed", "reason": reason}
-        results.append({"clip": str(clip), "textgrid": str(textgrid), **result})
+    inputs = [transcripts, dictionary, *found]
+    require_output(out / f"{found[0].stem}.TextGrid", inputs)
+    require_output(json, inputs)
+    jobs = [_Job(out, clip, *said.get(clip.stem, (transcripts, None))) for clip in found]
+    if aligner == "hmm":
+        results, training = _align_by_hmms(jobs, out / WORK, dictionary, breath=breath)
+    else:
+        results, training = _align_one_by_one(jobs), {}
     counts = {s: sum(r["status"] == s for r in results) for s in ("aligned", "kept", "failed")}
     if counts["failed"] < len(results):
         show_table(str(out), counts.items())
-    write_results({"folder": str(out), **counts, "clips": results}, json)
+    write_results({"folder": str(out), **counts, **training, "clips": results}, json)
     if counts["failed"]:
         raise typer.Exit(1)
 
 
-def read_transcripts(place: Path, clips: Sequence[Path]) -> dict[str, tuple[Path, str]]:
+def read_transcripts(place: Path, clips: Sequence[Path]) -> Transcripts:
     """The file that holds the transcript of each clip, and its text, by the clip's name.
 
     Raises:
@@ -88,33 +121,110 @@ def read_transcripts(place: Path, clips: Sequence[Path]) -> dict[str, tuple[Path
     return {Path(name.strip()).stem: (place, words) for name, _, words in rows}
 
 
-def read_text(path: Path) -> str:
-    """The text in the UTF-8 file `path`.
+class _Job(NamedTuple):
+    """The folder OUT, one clip, and the file and text of its transcript (None: there is none)."""
 
-    Raises:
-        InputError: There is none.
-    """
-    try:
-        return path.read_text("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not text in UTF-8; convert it") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    out: Path
+    clip: Path
+    transcript: Path
+    text: str | None
+
+    @property
+    def textgrid(self) -> Path:
+        return self.out / f"{self.clip.stem}.TextGrid"
+
+    @property
+    def words(self) -> str:
+        """The text; an InputError where there is none."""
+        if self.text is None:
+            raise InputError(f"{self.transcript}: holds no transcript of {self.clip.stem}; add it")
+        return self.text
+
+    def read_sound(self) -> tuple["NDArray[np.float32]", int]:
+        """The sound of the clip, (samples, rate), as long as its picture."""
+        from mmmgpu.sounds import check_sync, read_sound
+        from mmmgpu.videos import picture_start, probe
+
+        sound = read_sound(self.clip)
+        if picture_start(self.clip) is not None:
+            check_sync(probe(self.clip), sound)
+        return sound
+
+    def write(self, alignment: "Alignment") -> Result:
+        """Write the TextGrid."""
+        from mmmgpu.alignments import write_textgrid
+
+        write_textgrid(alignment, self.textgrid)
+        return self.result("aligned", phones=len(alignment.phones))
+
+    def failed(self, error: InputError) -> Result:
+        """Say why the clip cannot be aligned."""
+        reason = str(error).removeprefix(f"{self.clip}: ")
+        say(f"error: {self.clip}: {reason}")
+        return self.result("failed", reason=reason)
+
+    def result(self, status: str, **facts: Any) -> Result:
+        """What became of the clip, for --json."""
+        return {"clip": str(self.clip), "textgrid": str(self.textgrid), "status": status, **facts}
 
 
-def _align_clip(clip: Path, transcript: Path, words: str, textgrid: Path) -> dict[str, Any]:
-    """Write the TextGrid of one clip, unless one is there that is newer than what it comes from."""
+def _align_one_by_one(jobs: Sequence[_Job]) -> list[Result]:
+    """Align each clip by pocketsphinx, unless there is a TextGrid newer than what it comes from."""
     from mmmgpu.aligner import align_speech
-    from mmmgpu.alignments import write_textgrid
-    from mmmgpu.sounds import check_sync, read_sound
-    from mmmgpu.videos import picture_start, probe
+    from mmmgpu.progress import progress
 
-    sources = [f.stat().st_mtime_ns for f in (clip, transcript) if f.exists()]
-    if len(sources) == 2 and textgrid.is_file() and textgrid.stat().st_mtime_ns > max(sources):
-        return {"status": "kept"}
-    samples, rate = read_sound(clip)
-    if picture_start(clip) is not None:
-        check_sync(probe(clip), (samples, rate))
-    alignment = align_speech(samples, rate, words)
-    write_textgrid(alignment, textgrid)
-    return {"status": "aligned", "phones": len(alignment.phones)}
+    def align(job: _Job) -> Result:
+        sources = [f.stat().st_mtime_ns for f in (job.clip, job.transcript) if f.exists()]
+        made = job.textgrid.stat().st_mtime_ns if job.textgrid.is_file() else 0
+        if len(sources) == 2 and made > max(sources):
+            return job.result("kept")
+        return job.write(align_speech(*job.read_sound(), job.words))
+
+    results = []
+    for job in progress(jobs, "align clips"):
+        try:
+            results.append(align(job))
+        except InputError as error:
+            results.append(job.failed(error))
+    return results
+
+
+def _align_by_hmms(
+    jobs: Sequence[_Job], folder: Path, dictionary: Path | None, *, breath: bool
+) -> tuple[list[Result], Result]:
+    """Align all clips by models trained on them; the second of the results is about the training.
+
+    Until that is done its steps lie in `folder`.
+    """
+    from mmmgpu.checkpoints import fingerprint, open_checkpoints
+    from mmmgpu.hmm_aligner import align, make_recording, train_hmms
+    from mmmgpu.hmm_training import ROUNDS
+    from mmmgpu.progress import progress, progress_bar
+
+    words_of = _words_by(dictionary)
+    recordings, results = {}, {}
+    for job in progress(jobs, "read clips"):
+        try:
+            recordings[job] = make_recording(*job.read_sound(), words_of(job.words))
+        except InputError as error:
+            results[job] = job.failed(error)
+    if not recordings:
+        return list(results.values()), {}
+    files = [*filter(None, [dictionary]), *(f for job in recordings for f in job[1:3])]
+    steps = open_checkpoints(folder, fingerprint(files, {"breath": breath, "steps": 1}))
+    with progress_bar(sum(ROUNDS) * len(recordings), "train phone models") as advance:
+        trained = train_hmms([*recordings.values()], breath=breath, folder=steps, advance=advance)
+    for job, recording in progress(recordings.items(), "align clips"):
+        results[job] = job.write(align(trained.hmms, recording))
+    shutil.rmtree(folder)
+    return [results[job] for job in jobs], {"training": trained.facts}
+
+
+def _words_by(dictionary: Path | None) -> "Callable[[str], list[Spoken]]":
+    """How a text becomes words with their pronunciations: by `dictionary`, or English."""
+    from mmmgpu.lexicons import look_up, read_lexicon
+    from mmmgpu.pronunciation import look_up_english
+
+    if dictionary is None:
+        return look_up_english
+    return partial(look_up, lexicon=read_lexicon(dictionary), path=dictionary)

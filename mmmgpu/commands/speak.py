@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mmmgpu.commands.align import read_text
 from mmmgpu.commands.endings import say
 from mmmgpu.commands.options import Backend, Json, LibraryDefault, Lossless, ModelFile, VideoOut
 from mmmgpu.commands.places import require_output, require_video_output, write_results
 from mmmgpu.commands.summaries import flat, show_table
 from mmmgpu.errors import InputError
+from mmmgpu.files import read_text
 
 if TYPE_CHECKING:
     from mmmgpu.alignments import Alignment
