@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.arrays import check_some_valid
+from mmmgpu.arrays import F32, check_some_valid
+from mmmgpu.backends.orientation import orient
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
@@ -29,6 +30,24 @@ class Level:
     value: Any  # (B, h, w, C)
     weight: Any  # (B, h, w)
     threshold: float
+
+
+@dataclass(frozen=True)
+class Prototypes:
+    """Prototypes of height x width pixels on a device.
+
+    arrays: As the kernels of kernels/prototypes take them, from `images` to `row_shares`.
+    number, height, width: M and the size of a prototype.
+    nodes: See `mmmgpu.backends.orientation.Orientations`.
+    hole: Less weight makes a pixel a hole.
+    """
+
+    arrays: tuple[Any, ...]
+    number: int
+    height: int
+    width: int
+    nodes: int
+    hole: float
 
 
 @dataclass(frozen=True)
@@ -149,6 +168,48 @@ class Launches(ABC):
         self.launch_all("rbf.evaluate_rbf", math.ceil(number / LANES), inputs, [mapped])
         return mapped
 
+    def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
+        number, height, width, _ = images.shape
+        held = orient(flows, hole)
+        padded = np.ones((number, height, width, 4), np.float32)
+        padded[..., :3] = images
+        fixed = held.fixed, held.taps, held.shares
+        rows = held.rows, held.targets, held.starts, held.row_taps, held.row_shares
+        arrays = tuple(self.to_device(a) for a in (padded, *fixed, *rows))
+        return Prototypes(arrays, number, height, width, held.nodes, float(hole))
+
+    def move_prototypes(
+        self, held: Prototypes, flow: Any, used: Any, pixels: Any, scale: Any
+    ) -> Any:
+        number, asked = used.shape[0], pixels.shape[0]
+        moved = self.empty(number, asked, 3)
+        inputs = [flow, *held.arrays, used, pixels, scale, number, asked]
+        self._prototypes("move_prototypes", held, number, inputs, moved)
+        return moved
+
+    def mix_prototypes(self, held: Prototypes, flows: Any, weights: Any, pixels: Any) -> Any:
+        frames, asked = flows.shape[0], pixels.shape[0]
+        mixed = self.empty(frames, asked, 3)
+        inputs = [flows, *held.arrays, weights, pixels, frames, held.number, asked]
+        self._prototypes("mix_prototypes", held, frames, inputs, mixed)
+        return mixed
+
+    def _prototypes(
+        self, kernel: str, held: Prototypes, jobs: int, inputs: list[Any], output: Any
+    ) -> None:
+        """Launch a kernel of kernels/prototypes with an accumulator for every worker."""
+        if not math.prod(output.shape):
+            return
+        workers = min(self.workers, jobs)
+        size = _pyramid(held.height, held.width)
+        total = self.empty(workers, size, 4)
+        field = self.empty(workers, held.nodes, 2)
+        arrived = self.empty(jobs, dtype=np.int32)
+        inputs += [held.height, held.width, size, held.nodes, held.hole, workers]
+        outputs = [total, field, output, arrived]
+        self.launch_all(f"prototypes.{kernel}", workers, inputs, outputs)
+        check_some_valid(self.to_host(arrived))
+
     def _coarser(self, level: Level) -> Level:
         """An uninitialised level of half the size; its weights are numbers of valid pixels."""
         batch, height, width, channels = level.value.shape
@@ -178,3 +239,12 @@ class Launches(ABC):
         planes = self.empty(count, channels, math.ceil(points / LANES) * LANES)
         self.launch("distance_scan.pack", first, count, [fields, points, channels], [planes])
         return planes
+
+
+def _pyramid(height: int, width: int) -> int:
+    """Pixels of all levels of a picture, each half as high and wide as the one before."""
+    size = height * width
+    while (height, width) != (1, 1):
+        height, width = (height + 1) // 2, (width + 1) // 2
+        size += height * width
+    return size
