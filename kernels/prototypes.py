@@ -1,4 +1,4 @@
-"""Prototypes moved along flows of the model, each by itself or mixed: CE05, Eq. 2 in one launch.
+"""Prototypes moved along flows of the model and mixed: CE05, Eq. 2 in one launch.
 
 The flow that is missing to a prototype, carried to its pixels, is a fixed sparse mean of the
 model's flow less a fixed flow (see mmmgpu/backends/orientation.py). Along it the pixels are
@@ -63,10 +63,8 @@ def move(
     total: wp.array[vec4],
     here: int,
 ):
-    """Splat all pixels of prototype `m`."""
+    """Splat all pixels of prototype `m`; nothing is in the accumulator."""
     area = h * w
-    for i in range(area):
-        total[here + i] = vec4()
     for y in range(h):
         for x in range(w):
             i = m * area + y * w + x
@@ -90,16 +88,30 @@ def move(
 
 
 @wp.func
-def mean(total: vec4, least: float):
+def mean(sum: vec4, least: float):
     """The mean and a weight of 1 where at least that weight arrived, else nothing."""
-    if total[3] >= least:
-        return total * (1.0 / total[3])
-    return vec4()
+    if sum[3] < least:
+        return vec4()
+    share = 1.0 / sum[3]
+    return vec4(share * sum[0], share * sum[1], share * sum[2], 1.0)
 
 
 @wp.func
-def pull(total: wp.array[vec4], fine: int, h: int, w: int, hole: float, finest: int):
-    """The level after the one at `fine`: sums over the valid pixels of blocks, and their number."""
+def between(cells: wp.array[vec4], coarse: int, h: int, w: int, y: int, x: int):
+    """The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete."""
+    columns = (w + 1) / 2
+    x0 = x / 2
+    x1 = wp.clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1)
+    y0 = coarse + y / 2 * columns
+    y1 = coarse + wp.clamp(y / 2 + 2 * (y % 2) - 1, 0, (h - 1) / 2) * columns
+    near = 0.75 * cells[y0 + x0] + 0.25 * cells[y0 + x1]
+    far = 0.75 * cells[y1 + x0] + 0.25 * cells[y1 + x1]
+    return 0.75 * near + 0.25 * far
+
+
+@wp.func
+def pull(cells: wp.array[vec4], fine: int, h: int, w: int):
+    """The level after the one of h x w at `fine`: sums over blocks of 2 x 2."""
     coarse = fine + h * w
     columns = (w + 1) / 2
     for y in range((h + 1) / 2):
@@ -109,153 +121,108 @@ def pull(total: wp.array[vec4], fine: int, h: int, w: int, hole: float, finest: 
         for x in range(columns):
             left = 2 * x
             right = wp.min(left + 1, w - 1)
-            a = total[upper + left]
-            b = total[upper + right]
-            c = total[lower + left]
-            d = total[lower + right]
-            if finest == 1:
-                a = mean(a, hole)
-                b = mean(b, hole)
-                c = mean(c, hole)
-                d = mean(d, hole)
+            sum = cells[upper + left] + cells[upper + right]
+            sum += cells[lower + left] + cells[lower + right]
             share = wp.where(left + 1 < w, double, 0.5 * double)
-            total[coarse + y * columns + x] = share * (a + b + c + d)
+            cells[coarse + y * columns + x] = share * sum
 
 
 @wp.func
-def between(total: wp.array[vec4], fine: int, h: int, w: int, y: int, x: int):
-    """The pixel (x, y) of the level at `fine`, interpolated from the next one."""
-    columns = (w + 1) / 2
-    x0 = x / 2
-    x1 = wp.clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1)
-    y0 = fine + h * w + y / 2 * columns
-    y1 = fine + h * w + wp.clamp(y / 2 + 2 * (y % 2) - 1, 0, (h - 1) / 2) * columns
-    near = 0.75 * total[y0 + x0] + 0.25 * total[y0 + x1]
-    far = 0.75 * total[y1 + x0] + 0.25 * total[y1 + x1]
-    return 0.75 * near + 0.25 * far
-
-
-@wp.func
-def fill(total: wp.array[vec4], here: int, height: int, width: int, hole: float):
-    """Pull-push of all levels but the finest. Returns the number of pixels that are no holes."""
+def fill(cells: wp.array[vec4], first: int, height: int, width: int):
+    """Pull-push of a level of sums and all that follow. Returns the sum of all weights."""
     h = int(height)
     w = int(width)
-    at = int(here)
-    levels = int(0)
+    at = int(first)
+    levels = int(1)
     while h > 1 or w > 1:
-        pull(total, at, h, w, hole, wp.where(levels == 0, 1, 0))
+        pull(cells, at, h, w)
         at += h * w
         h = (h + 1) / 2
         w = (w + 1) / 2
         levels += 1
-    number = int(total[at][3] + 0.5)
-    total[at] = mean(total[at], 0.5)
-    for up in range(1, levels):
+    number = int(cells[at][3])
+    for up in range(levels):
         h = int(height)
         w = int(width)
-        at = int(here)
-        for _ in range(levels - up):
+        at = int(first)
+        for _ in range(levels - 1 - up):
             at += h * w
             h = (h + 1) / 2
             w = (w + 1) / 2
         for y in range(h):
             for x in range(w):
                 i = at + y * w + x
-                if total[i][3] >= 0.5:
-                    total[i] = mean(total[i], 0.5)
-                else:
-                    total[i] = between(total, at, h, w, y, x)
+                if cells[i][3] > 0.0:
+                    cells[i] = mean(cells[i], 1.0)
+                elif up > 0:
+                    cells[i] = between(cells, at + h * w, h, w, y, x)
     return number
 
 
 @wp.func
-def put(out: wp.array[float], i: int, colour: vec4):
+def show(out: wp.array[float], i: int, colour: vec4, more: int):
+    """Write a colour, or add it."""
     for c in range(3):
-        out[3 * i + c] = colour[c]
+        if more == 1:
+            out[3 * i + c] = out[3 * i + c] + colour[c]
+        else:
+            out[3 * i + c] = colour[c]
 
 
 @wp.func
-def add(out: wp.array[float], i: int, colour: vec4):
-    for c in range(3):
-        out[3 * i + c] = out[3 * i + c] + colour[c]
-
-
-@wp.kernel
-def move_prototypes(
-    flow: wp.array[vec2],  # (H * W) [px] of the model
-    images: wp.array[vec4],  # (M, H * W), weight 1
-    fixed: wp.array[vec2],  # (M, H * W) [px] taken off the mean of `flow`
-    taps: wp.array[taps_t],  # (M, H * W, 6) pixels of the mean; first -1: there is a row for it
-    shares: wp.array[shares_t],  # (M, H * W, 6) their shares
-    rows: wp.array[int],  # (M + 1) first row of each prototype
-    targets: wp.array[int],  # (rows) what a row is for: a pixel, or from H * W on a cell
-    starts: wp.array[int],  # (rows + 1) its first tap
-    row_taps: wp.array[int],  # pixels, or from H * W on cells of rows before
-    row_shares: wp.array[float],
-    used: wp.array[int],  # (n,) prototypes
-    pixels: wp.array[int],  # (P,) that are asked for
-    scale: wp.array[float],  # (P,) of what is written there
-    number: int,  # n
-    asked: int,  # P
-    height: int,
-    width: int,
-    size: int,  # of a pyramid
-    nodes: int,  # H * W and cells of a prototype
+def settle(
+    total: wp.array[vec4],
+    here: int,
+    h: int,
+    w: int,
     hole: float,
-    workers: int,
+    places: wp.array[int],
+    scale: wp.array[float],
+    weight: float,
+    more: int,
+    out: wp.array[float],
+    start: int,
+    cells: wp.array[vec4],
     first: int,
-    count: int,
-    # outputs
-    total: wp.array[vec4],  # (workers, size) scratch
-    field: wp.array[vec2],  # (workers, nodes) scratch
-    moved: wp.array[float],  # (n, P, 3)
-    arrived: wp.array[int],  # (n,) 0 where a prototype has nothing but holes
+    holes: wp.array[int],
 ):
-    tid = wp.tid()
-    if tid >= count:
-        return
-    here = (first + tid) * size
-    there = (first + tid) * nodes
-    for i in range(height * width):
-        field[there + i] = flow[i]
-    for job in range(first + tid, number, workers):
-        move(
-            used[job],
-            images,
-            fixed,
-            taps,
-            shares,
-            rows,
-            targets,
-            starts,
-            row_taps,
-            row_shares,
-            height,
-            width,
-            field,
-            there,
-            total,
-            here,
-        )
-        arrived[job] = asked
-        for i in range(asked):
-            sum = total[here + pixels[i]]
-            if sum[3] >= hole:
-                put(moved, job * asked + i, scale[i] * mean(sum, hole))
-            else:
-                arrived[job] -= 1
-        if arrived[job] < asked:
-            arrived[job] = fill(total, here, height, width, hole)
-            for i in range(asked):
-                s = pixels[i]
-                if total[here + s][3] < hole:
-                    colour = between(total, here, height, width, s / width, s % width)
-                    put(moved, job * asked + i, scale[i] * colour)
+    """Show what arrived, and what is filled, at pixels that have a place; empty the accumulator.
+
+    Returns 0 where nothing arrived.
+    """
+    columns = (w + 1) / 2
+    gaps = int(0)
+    for y in range((h + 1) / 2):
+        for x in range(columns):
+            block = vec4()
+            for tap in range(4):
+                ty = 2 * y + tap / 2
+                tx = 2 * x + tap % 2
+                if ty < h and tx < w:
+                    i = ty * w + tx
+                    colour = mean(total[here + i], hole)
+                    total[here + i] = vec4()
+                    block += colour
+                    if places[i] >= 0:
+                        if colour[3] > 0.0:
+                            show(out, start + places[i], weight * scale[i] * colour, more)
+                        else:
+                            holes[here + gaps] = i
+                            gaps += 1
+            cells[first + y * columns + x] = block
+    if gaps == 0:
+        return 1
+    number = fill(cells, first, (h + 1) / 2, columns)
+    for j in range(gaps):
+        i = holes[here + j]
+        colour = between(cells, first, h, w, i / w, i % w)
+        show(out, start + places[i], weight * scale[i] * colour, more)
+    return number
 
 
 @wp.kernel
 def mix_prototypes(
-    flows: wp.array[vec2],  # (frames, H * W) [px] of the model
+    flows: wp.array[vec2],  # (frames, H * W) [px] of the model, frames is 1 or the mixtures
     images: wp.array[vec4],  # (M, H * W), weight 1
     fixed: wp.array[vec2],  # (M, H * W) [px] taken off the mean of a flow
     taps: wp.array[taps_t],  # (M, H * W, 6) pixels of the mean; first -1: there is a row for it
@@ -265,70 +232,78 @@ def mix_prototypes(
     starts: wp.array[int],  # (rows + 1) its first tap
     row_taps: wp.array[int],  # pixels, or from H * W on cells of rows before
     row_shares: wp.array[float],
-    weights: wp.array[float],  # (frames, M); a prototype without weight is not looked at
-    pixels: wp.array[int],  # (P,) that are asked for
+    parts: wp.array[int],  # (mixtures + 1) first member of each mixture
+    members: wp.array[int],  # (parts[mixtures]) prototypes
+    weights: wp.array[float],  # (parts[mixtures]) their weights
+    places: wp.array[int],  # (H * W) where a pixel is written, -1 for nowhere
+    scale: wp.array[float],  # (H * W) of what is written
     frames: int,
-    number: int,  # M
-    asked: int,  # P
+    mixtures: int,
+    asked: int,  # P places
     height: int,
     width: int,
-    size: int,  # of a pyramid
+    size: int,  # of a pyramid without its finest level
     nodes: int,  # H * W and cells of a prototype
     hole: float,
     workers: int,
     first: int,
     count: int,
     # outputs
-    total: wp.array[vec4],  # (workers, size) scratch
+    total: wp.array[vec4],  # (workers, H * W) scratch
+    cells: wp.array[vec4],  # (workers, size) scratch
+    holes: wp.array[int],  # (workers, H * W) scratch
     field: wp.array[vec2],  # (workers, nodes) scratch
-    mixed: wp.array[float],  # (frames, P, 3)
-    arrived: wp.array[int],  # (frames,) 0 where a prototype has nothing but holes
+    mixed: wp.array[float],  # (mixtures, P, 3)
+    arrived: wp.array[int],  # (mixtures,) 0 where a prototype has nothing but holes
 ):
     tid = wp.tid()
     if tid >= count:
         return
-    here = (first + tid) * size
-    there = (first + tid) * nodes
+    worker = first + tid
     area = height * width
-    for job in range(first + tid, frames, workers):
-        for i in range(area):
-            field[there + i] = flows[job * area + i]
-        for i in range(3 * asked):
-            mixed[3 * job * asked + i] = 0.0
+    for i in range(area):
+        total[worker * area + i] = vec4()
+    for job in range(worker, mixtures, workers):
+        if frames > 1 or job == worker:
+            for i in range(area):
+                field[worker * nodes + i] = flows[job % frames * area + i]
         arrived[job] = 1
-        for m in range(number):
-            weight = weights[job * number + m]
-            if weight != 0.0:
-                move(
-                    m,
-                    images,
-                    fixed,
-                    taps,
-                    shares,
-                    rows,
-                    targets,
-                    starts,
-                    row_taps,
-                    row_shares,
-                    height,
-                    width,
-                    field,
-                    there,
-                    total,
-                    here,
-                )
-                gaps = int(0)
-                for i in range(asked):
-                    sum = total[here + pixels[i]]
-                    if sum[3] >= hole:
-                        add(mixed, job * asked + i, weight * mean(sum, hole))
-                    else:
-                        gaps += 1
-                if gaps > 0:
-                    if fill(total, here, height, width, hole) == 0:
-                        arrived[job] = 0
-                    for i in range(asked):
-                        s = pixels[i]
-                        if total[here + s][3] < hole:
-                            colour = between(total, here, height, width, s / width, s % width)
-                            add(mixed, job * asked + i, weight * colour)
+        if parts[job] == parts[job + 1]:
+            for i in range(3 * asked):
+                mixed[3 * job * asked + i] = 0.0
+        for part in range(parts[job], parts[job + 1]):
+            move(
+                members[part],
+                images,
+                fixed,
+                taps,
+                shares,
+                rows,
+                targets,
+                starts,
+                row_taps,
+                row_shares,
+                height,
+                width,
+                field,
+                worker * nodes,
+                total,
+                worker * area,
+            )
+            number = settle(
+                total,
+                worker * area,
+                height,
+                width,
+                hole,
+                places,
+                scale,
+                weights[part],
+                wp.where(part > parts[job], 1, 0),
+                mixed,
+                job * asked,
+                cells,
+                worker * size,
+                holes,
+            )
+            arrived[job] = wp.min(arrived[job], number)

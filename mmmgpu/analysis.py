@@ -54,7 +54,8 @@ class Analyzer:
     along: the prototype flows there, x above y, (2 n, M - 1).
     gram: Cholesky factor of the regularised Gram matrix of the flows.
     order: indices of all pixels, those with w_t above 0.01 first; textured: how many these are.
-    scale: sqrt(w_t) of these, 1 of the others, in that order.
+    scale: sqrt(w_t) of these, 1 of the others, (h, w).
+    places, masked: each pixel's place in that order, (h, w), and the same with -1 for the others.
     thumbnails: small masked prototypes, (M, k).
     """
 
@@ -67,9 +68,11 @@ class Analyzer:
     weight: F32
     along: F32
     gram: tuple[Floats, bool]
-    order: NDArray[np.int32]
+    order: NDArray[np.int64]
     textured: int
     scale: F32
+    places: NDArray[np.int32]
+    masked: NDArray[np.int32]
     thumbnails: F32
 
 
@@ -93,8 +96,9 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
             "the mouth never moves in the prototypes; give clips of speech, or --region X,Y,W,H"
         )
     regular = gram.astype(np.float64) + FLOW_RIDGE * energy * np.eye(len(gram))
-    textured = basis.w_t.ravel() > MOUTH
-    order = np.argsort(~textured, kind="stable").astype(np.int32)
+    textured = basis.w_t > MOUTH
+    order = np.argsort(~textured.ravel(), kind="stable")
+    places = np.argsort(order).astype(np.int32).reshape(basis.w_t.shape)
     return Analyzer(
         basis=basis,
         inside=inside,
@@ -107,7 +111,9 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
         gram=cho_factor(regular),
         order=order,
         textured=int(textured.sum()),
-        scale=np.where(textured, np.sqrt(basis.w_t.ravel()), np.float32(1))[order],
+        scale=np.where(textured, np.sqrt(basis.w_t), np.float32(1)),
+        places=places,
+        masked=np.where(textured, places, np.int32(-1)),
         thumbnails=np.stack([thumbnail(image, basis.w_t) for image in basis.images]),
     )
 
@@ -138,7 +144,8 @@ def analyze(analyzer: Analyzer, image: F32) -> tuple[Floats, Floats]:
         alpha = _refine(analyzer, image, alpha, flow, made)
         used = np.flatnonzero(beta > NO_TEXTURE)
     every = np.arange(len(analyzer.thumbnails))
-    warped = _warped(analyzer, analyzer.basis.flow(alpha), every, analyzer.textured)
+    flow = analyzer.basis.flow(alpha)
+    warped = _warped(analyzer, flow, every, analyzer.masked, analyzer.textured)
     return alpha, _fit_beta(analyzer, image, warped, every)
 
 
@@ -176,15 +183,20 @@ def _refine(analyzer: Analyzer, image: F32, alpha: Floats, flow: F32, made: F32)
     mean = (made + image) / 2
     slopes = [cv2.Scharr(mean, -1, *axis) / 32 for axis in ((1, 0), (0, 1))]
     error, gx, gy = (_pulled(analyzer, f, flow) for f in (image - made, *slopes))
-    w = analyzer.weight / (1 + (error**2).sum(axis=1) / OUTLIER**2)
-    xx, xy, yy = (w * (a * b).sum(axis=1) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
+    w = analyzer.weight / (1 + _dot(error, error) / OUTLIER**2)
+    xx, xy, yy = (w * _dot(a, b) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
     rows = _rooted(xx, xy, yy, *np.split(analyzer.along, 2))
     normal = rows.T @ rows
-    pull = np.concatenate([w * (g * error).sum(axis=1) for g in (gx, gy)])
+    right = np.concatenate([w * _dot(g, error) for g in (gx, gy)]) @ analyzer.along
     ridge = STEP_RIDGE * float(np.trace(normal)) / len(normal)
     regular = normal.astype(np.float64) + ridge * np.eye(len(normal))
-    step: Floats = cho_solve(cho_factor(regular), -(pull @ analyzer.along) - ridge * alpha)
+    step: Floats = cho_solve(cho_factor(regular), -right - ridge * alpha)
     return alpha + step
+
+
+def _dot(a: F32, b: F32) -> F32:
+    """Sums over the channels of a b, (n, 3) -> (n,)."""
+    return np.asarray(np.einsum("nc,nc->n", a, b))
 
 
 def _rooted(xx: F32, xy: F32, yy: F32, x: F32, y: F32) -> F32:
@@ -210,32 +222,35 @@ def _fit_texture(
     analyzer: Analyzer, image: F32, flow: F32, used: NDArray[np.int64]
 ) -> tuple[Floats, F32]:
     """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3)."""
-    warped = _warped(analyzer, flow, used, len(analyzer.order))
+    warped = _warped(analyzer, flow, used, analyzer.places, len(analyzer.order))
     beta = _fit_beta(analyzer, image, warped, used)
     mixed = (beta[used].astype(np.float32) @ warped).reshape(-1, 3)
-    made = np.empty_like(image)
-    made.reshape(-1, 3)[analyzer.order] = mixed / analyzer.scale[:, None]
+    made = mixed[analyzer.places] / analyzer.scale[..., None]
     return beta, made
 
 
-def _warped(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], count: int) -> F32:
-    """The prototypes `used` (n,) along `flow` at the first `count` pixels of the order, scaled.
-
-    Shape (n, 3 count).
-    """
+def _warped(
+    analyzer: Analyzer,
+    flow: F32,
+    used: NDArray[np.int64],
+    places: NDArray[np.int32],
+    count: int,
+) -> F32:
+    """The prototypes `used` (n,) along `flow`, scaled, at `count` places: (n, 3 count)."""
     k = analyzer.kernels
-    which = (used.astype(np.int32), analyzer.order[:count], analyzer.scale[:count])
-    moved = k.move_prototypes(analyzer.held, k.to_device(flow), *map(k.to_device, which))
+    given = (flow, used.astype(np.int32), places, analyzer.scale)
+    to, which, where, scale = map(k.to_device, given)
+    moved = k.move_prototypes(analyzer.held, to, which, where, scale, count)
     return k.to_host(moved).reshape(len(used), 3 * count)
 
 
 def _fit_beta(analyzer: Analyzer, image: F32, warped: F32, used: NDArray[np.int64]) -> Floats:
     """beta (M,), zero outside `used`; warped: what `_warped` gives."""
-    count = analyzer.textured
-    wanted = image.reshape(-1, 3)[analyzer.order[:count]] * analyzer.scale[:count, None]
-    a = warped[:, : 3 * count]
+    scaled = (image * analyzer.scale[..., None]).reshape(-1, 3)
+    wanted = scaled[analyzer.order[: analyzer.textured]].ravel()
+    a = warped[:, : len(wanted)]
     beta = np.zeros(len(analyzer.thumbnails))
-    beta[used] = solve_simplex(a @ a.T, a @ wanted.ravel())
+    beta[used] = solve_simplex(a @ a.T, a @ wanted)
     return beta
 
 

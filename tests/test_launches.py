@@ -21,18 +21,27 @@ def prototypes(name, size, seed=0):
     return rng.random((NUMBER, *size, 3), dtype=np.float32), flows
 
 
-def moved(name, images, flows, flow, used, pixels, scale, threads=None):
-    k = get_backend(name, threads)
-    held = k.hold_prototypes(images, flows, HOLE)
-    given = flow, np.int32(used), np.int32(pixels), np.float32(scale)
-    return k.to_host(k.move_prototypes(held, *map(k.to_device, given)))
+def placed(size, pixels):
+    """Each of `pixels` goes to its position in the list, all others nowhere."""
+    places = np.full(size[0] * size[1], -1, np.int32)
+    places[list(pixels)] = np.arange(len(pixels))
+    return places.reshape(size)
 
 
-def mixed(name, images, flows, wanted, weights, pixels, threads=None):
-    k = get_backend(name, threads)
+def moved(name, images, flows, flow, used, pixels, scale=None, threads=None):
+    k, size = get_backend(name, threads), images.shape[1:3]
     held = k.hold_prototypes(images, flows, HOLE)
-    given = wanted, np.float32(weights), np.int32(pixels)
-    return k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
+    scale = np.ones(size) if scale is None else scale
+    given = flow, np.int32(used), placed(size, pixels), np.float32(scale)
+    return k.to_host(k.move_prototypes(held, *map(k.to_device, given), len(pixels)))
+
+
+def mixed(name, images, flows, wanted, weights, pixels, scale=None, threads=None):
+    k, size = get_backend(name, threads), images.shape[1:3]
+    held = k.hold_prototypes(images, flows, HOLE)
+    scale = np.ones(size) if scale is None else scale
+    given = wanted, np.float32(weights), placed(size, pixels), np.float32(scale)
+    return k.to_host(k.mix_prototypes(held, *map(k.to_device, given), len(pixels)))
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -41,8 +50,8 @@ def mixed(name, images, flows, wanted, weights, pixels, threads=None):
 def test_moved_prototypes(backend, own, to, size):
     images, flows = prototypes(own, size)
     flow = FLOWS[to](np.random.default_rng(3), *size)
-    pixels = np.arange(0, size[0] * size[1], 2)
-    scale = np.random.default_rng(4).random(len(pixels))
+    rng = np.random.default_rng(4)
+    pixels, scale = rng.permutation(size[0] * size[1])[::2], rng.random(size)
     given = images, flows, flow, [2, 0, 1, 2], pixels, scale
     try:
         desired = moved("numpy", *given)
@@ -61,7 +70,8 @@ def test_mixed_prototypes(backend, own, size):
     weights = rng.dirichlet(np.ones(NUMBER), 4)
     weights[1, 0] = 0
     wanted = np.einsum("bm,mhwc->bhwc", rng.normal(0, 0.5, (4, NUMBER)), flows).astype(np.float32)
-    given = images, flows, wanted, weights, np.arange(size[0] * size[1])
+    pixels = rng.permutation(size[0] * size[1])[::2]
+    given = images, flows, wanted, weights, pixels, rng.random(size)
     desired = mixed("numpy", *given)
     assert_allclose(mixed(backend, *given), desired, rtol=0, atol=1e-4)
 
@@ -69,7 +79,7 @@ def test_mixed_prototypes(backend, own, size):
 def test_the_reference_mixes_what_it_moves():
     images, flows = prototypes("random", (9, 12))
     weights, pixels = np.float32([[0.2, 0.5, 0.3]]), np.arange(10, 60, 3)
-    apart = moved("numpy", images, flows, flows[2], range(NUMBER), pixels, np.ones(len(pixels)))
+    apart = moved("numpy", images, flows, flows[2], range(NUMBER), pixels)
     together = mixed("numpy", images, flows, flows[2:], weights, pixels)
     assert_allclose(together[0], np.tensordot(weights[0], apart, axes=1), rtol=0, atol=1e-6)
 
@@ -94,7 +104,7 @@ def test_nothing_asked_gives_nothing(backend, frames, pixels):
         pixels,
         3,
     )
-    empty = moved(backend, images, flows, flows[1], [], range(pixels), np.ones(pixels))
+    empty = moved(backend, images, flows, flows[1], [], range(pixels))
     assert empty.shape == (0, pixels, 3)
 
 
@@ -104,7 +114,7 @@ def test_any_number_of_threads_gives_the_same_bits(backend):
     weights = np.random.default_rng(6).random((NUMBER, NUMBER))
     for run, given in (
         (mixed, (wanted, weights, pixels)),
-        (moved, (wanted[0], [0, 1, 2], pixels, np.ones(len(pixels)))),
+        (moved, (wanted[0], [0, 1, 2], pixels)),
     ):
         one, *others = (run(backend, images, flows, *given, threads=n) for n in (1, 2, 5))
         for other in others:
@@ -115,6 +125,6 @@ def test_a_prototype_that_leaves_the_picture_is_an_error(backend):
     images, flows = prototypes("zero", (6, 6))
     gone = np.full((6, 6, 2), 50, np.float32)
     with pytest.raises(InputError, match="no pixel"):
-        moved(backend, images, flows, gone, [0], [1], [1])
+        moved(backend, images, flows, gone, [0], [1])
     with pytest.raises(InputError, match="no pixel"):
         mixed(backend, images, flows, np.stack([flows[0], gone]), np.ones((2, NUMBER)), [1])

@@ -68,6 +68,8 @@ def test_pixels_that_stay_need_no_rows():
     assert len(o.targets) == 0
     assert o.nodes == 35
     assert_array_equal(o.taps[0, :, 0], np.arange(35))
+    assert o.taps.min() >= 0
+    assert o.taps.max() < 35
     assert_array_equal(o.shares[0], np.eye(TAPS)[:1].repeat(35, axis=0))
     assert_array_equal(o.fixed, 0)
 

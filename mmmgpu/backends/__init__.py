@@ -65,17 +65,21 @@ class Backend(Protocol):
         filled.
         """
 
-    def move_prototypes(self, held: Any, flow: Any, used: Any, pixels: Any, scale: Any, /) -> Any:
+    def move_prototypes(
+        self, held: Any, flow: Any, used: Any, places: Any, scale: Any, asked: int, /
+    ) -> Any:
         """Some of what `hold_prototypes` gave, each moved along C_syn as in CE05, Eq. 2.
 
-        (H, W, 2), numbers of prototypes (n,) and of pixels (P,) int32, (P,) -> (n, P, 3), times
-        `scale`.
+        (H, W, 2), (n,) int32, (H, W) int32, (H, W) -> (n, P, 3). A pixel goes to its place, one of
+        the P = `asked` or -1 for none, times its scale.
         """
 
-    def mix_prototypes(self, held: Any, flows: Any, weights: Any, pixels: Any, /) -> Any:
-        """CE05, Eq. 2: (B, H, W, 2), (B, M), pixels (P,) int32 -> (B, P, 3).
+    def mix_prototypes(
+        self, held: Any, flows: Any, weights: Any, places: Any, scale: Any, asked: int, /
+    ) -> Any:
+        """CE05, Eq. 2: (B, H, W, 2), (B, M), (H, W) int32, (H, W) -> (B, P, 3).
 
-        A prototype costs nothing where its weight is 0.
+        A prototype costs nothing where its weight is 0; else as `move_prototypes`.
         """
 
 

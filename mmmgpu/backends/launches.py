@@ -179,36 +179,52 @@ class Launches(ABC):
         return Prototypes(arrays, number, height, width, held.nodes, float(hole))
 
     def move_prototypes(
-        self, held: Prototypes, flow: Any, used: Any, pixels: Any, scale: Any
+        self, held: Prototypes, flow: Any, used: Any, places: Any, scale: Any, asked: int
     ) -> Any:
-        number, asked = used.shape[0], pixels.shape[0]
-        moved = self.empty(number, asked, 3)
-        inputs = [flow, *held.arrays, used, pixels, scale, number, asked]
-        self._prototypes("move_prototypes", held, number, inputs, moved)
-        return moved
+        members = self.to_host(used)
+        alone = [np.arange(len(members) + 1), members, np.ones(len(members))]
+        return self._mixtures(held, flow, 1, alone, [places, scale], asked)
 
-    def mix_prototypes(self, held: Prototypes, flows: Any, weights: Any, pixels: Any) -> Any:
-        frames, asked = flows.shape[0], pixels.shape[0]
-        mixed = self.empty(frames, asked, 3)
-        inputs = [flows, *held.arrays, weights, pixels, frames, held.number, asked]
-        self._prototypes("mix_prototypes", held, frames, inputs, mixed)
-        return mixed
+    def mix_prototypes(
+        self, held: Prototypes, flows: Any, weights: Any, places: Any, scale: Any, asked: int
+    ) -> Any:
+        shares = self.to_host(weights)
+        parts = np.concatenate([[0], np.cumsum(np.count_nonzero(shares, axis=1))])
+        members = [parts, np.nonzero(shares)[1], shares[shares != 0]]
+        return self._mixtures(held, flows, len(shares), members, [places, scale], asked)
 
-    def _prototypes(
-        self, kernel: str, held: Prototypes, jobs: int, inputs: list[Any], output: Any
-    ) -> None:
-        """Launch a kernel of kernels/prototypes with an accumulator for every worker."""
-        if not math.prod(output.shape):
-            return
-        workers = min(self.workers, jobs)
-        size = _pyramid(held.height, held.width)
-        total = self.empty(workers, size, 4)
-        field = self.empty(workers, held.nodes, 2)
-        arrived = self.empty(jobs, dtype=np.int32)
-        inputs += [held.height, held.width, size, held.nodes, held.hole, workers]
-        outputs = [total, field, output, arrived]
-        self.launch_all(f"prototypes.{kernel}", workers, inputs, outputs)
+    def _mixtures(
+        self,
+        held: Prototypes,
+        flows: Any,
+        frames: int,
+        members: list[Any],
+        where: list[Any],
+        asked: int,
+    ) -> Any:
+        """Run kernels/prototypes with an accumulator for every worker."""
+        mixtures, area = len(members[0]) - 1, held.height * held.width
+        mixed = self.empty(mixtures, asked, 3)
+        if not mixtures * asked:
+            return mixed
+        workers = min(self.workers, mixtures)
+        size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
+        arrived = self.empty(mixtures, dtype=np.int32)
+        given = zip(members, (np.int32, np.int32, np.float32), strict=True)
+        inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), *where]
+        inputs += [frames, mixtures, asked, held.height, held.width, size, held.nodes, held.hole]
+        inputs.append(workers)
+        outputs = [
+            self.empty(workers, area, 4),
+            self.empty(workers, size, 4),
+            self.empty(workers, area, dtype=np.int32),
+            self.empty(workers, held.nodes, 2),
+            mixed,
+            arrived,
+        ]
+        self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
         check_some_valid(self.to_host(arrived))
+        return mixed
 
     def _coarser(self, level: Level) -> Level:
         """An uninitialised level of half the size; its weights are numbers of valid pixels."""

@@ -60,8 +60,8 @@ def orient(flows: F32, hole: float) -> Orientations:
         InputError: A flow leaves no pixel in the picture.
     """
     number, h, w, _ = flows.shape
-    taps = np.zeros((number, h * w, TAPS), np.int32)
-    shares = np.zeros((number, h * w, TAPS), np.float32)
+    taps = np.empty((number, h * w, TAPS), np.int32)
+    shares = np.empty((number, h * w, TAPS), np.float32)
     fixed = np.empty((number, h * w, 2), np.float32)
     rows: list[Any] = []
     targets: list[Numbers] = []
@@ -71,7 +71,7 @@ def orient(flows: F32, hole: float) -> Orientations:
         members, through = _filling(valid)
         cells, holes = members @ pixels, np.flatnonzero(~valid)
         many = np.flatnonzero(np.diff(pixels.indptr) > TAPS)
-        _fill_regular(pixels, taps[i], shares[i])
+        taps[i], shares[i] = _regular(pixels)
         taps[i, many, 0] = taps[i, holes, 0] = OWN_ROW
         own = flow.reshape(-1, 2).astype(np.float64)
         carried = pixels @ own
@@ -118,13 +118,11 @@ def _splatted(flow: F32, hole: float) -> tuple[Any, NDArray[np.bool_]]:
     return pixels, valid.reshape(h, w)
 
 
-def _fill_regular(pixels: Any, taps: I32, shares: F32) -> None:
-    """Write the first `TAPS` taps of every pixel; what is missing has no share."""
-    first, count = pixels.indptr[:-1], np.diff(pixels.indptr)
-    for k in range(TAPS):
-        some = count > k
-        taps[some, k] = pixels.indices[first[some] + k]
-        shares[some, k] = pixels.data[first[some] + k]
+def _regular(pixels: Any) -> tuple[I32, F32]:
+    """The first `TAPS` taps of every pixel and their shares, (h w, 6); what is missing has none."""
+    there = np.arange(TAPS) < np.diff(pixels.indptr)[:, None]
+    at = np.where(there, pixels.indptr[:-1, None] + np.arange(TAPS), 0)
+    return pixels.indices[at], np.where(there, pixels.data[at], 0).astype(np.float32)
 
 
 def _filling(valid: NDArray[np.bool_]) -> tuple[Any, Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.errors import InputError
 
-Numbers = NDArray[np.integer[Any]]
+I32 = NDArray[np.int32]
 
 FAR = 1e8  # [px] beyond any picture, inside int32
 
@@ -88,21 +88,25 @@ class Reference:
         return Prototypes(images, flows, hole)
 
     def move_prototypes(
-        self, held: Prototypes, flow: F32, used: Numbers, pixels: Numbers, scale: F32
+        self, held: Prototypes, flow: F32, used: I32, places: I32, scale: F32, asked: int
     ) -> F32:
-        moved = np.empty((len(used), len(pixels), 3), np.float32)
+        moved = np.empty((len(used), asked, 3), np.float32)
+        shown = np.flatnonzero(places >= 0)
         for j, i in enumerate(used):
             own = held.flows[i : i + 1]
             oriented = self._filled_warp(flow[None] - own, own, held.hole)
             seen = self._filled_warp(held.images[i : i + 1], oriented, held.hole)
-            moved[j] = seen.reshape(-1, 3)[pixels] * scale[:, None]
+            scaled = seen[0] * scale[..., None]
+            moved[j, places.ravel()[shown]] = scaled.reshape(-1, 3)[shown]
         return moved
 
-    def mix_prototypes(self, held: Prototypes, flows: F32, weights: F32, pixels: Numbers) -> F32:
-        mixed = np.zeros((len(flows), len(pixels), 3), np.float32)
+    def mix_prototypes(
+        self, held: Prototypes, flows: F32, weights: F32, places: I32, scale: F32, asked: int
+    ) -> F32:
+        mixed = np.zeros((len(flows), asked, 3), np.float32)
         for b, (flow, share) in enumerate(zip(flows, weights, strict=True)):
-            used = np.flatnonzero(share)
-            moved = self.move_prototypes(held, flow, used, pixels, np.ones(len(pixels), np.float32))
+            used = np.flatnonzero(share).astype(np.int32)
+            moved = self.move_prototypes(held, flow, used, places, scale, asked)
             mixed[b] = np.tensordot(share[used].astype(np.float64), moved, axes=1)
         return mixed
 
