@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.adaptation_folds import METHODS, Adapted, adapt_models
 from mmmgpu.analysis import analyze, prepare_analysis
-from mmmgpu.backends import get_backend
+from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.basis import Basis
 from mmmgpu.corpora import Clip, check_rates, open_corpus
 from mmmgpu.corpus_steps import (
@@ -34,6 +34,7 @@ from mmmgpu.errors import InputError
 from mmmgpu.flows import MATCHERS
 from mmmgpu.gdlr import RULES, Descent
 from mmmgpu.models import Model
+from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.phonemes import PhonemeModels, Utterance, coverage
 from mmmgpu.phones import CE05_PHONES, SIL, ce05_phone
 from mmmgpu.progress import progress_bar
@@ -233,9 +234,13 @@ class _Adaptation:
 
     def _old_in_new(self, basis: Basis) -> tuple[Floats, Floats]:
         """Eq. 11-12: A (M' - 1, M - 1) and B (M', M); column k is old prototype k in the new."""
-        old, analyzer = self.model.basis, prepare_analysis(basis, flow=self.options.flow)
-        kernels = get_backend(self.backend, 1)
-        found = [analyze(analyzer, image, kernels) for image in old.images]
+        old, kernels = self.model.basis, get_backend(self.backend, 1)
+        analyzer = prepare_analysis(basis, kernels, flow=self.options.flow)
+
+        def one(image: F32, _: Cancelled) -> tuple[Floats, Floats]:
+            return analyze(analyzer, image)
+
+        found = list(map_ordered(one, old.images, threads=default_threads()))
         alpha = np.stack([a for a, _ in found], axis=1)[:, old.moving]
         return alpha, np.stack([b for _, b in found], axis=1)
 

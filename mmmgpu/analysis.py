@@ -1,6 +1,6 @@
 """Analysis: the model coordinates of a real mouth image (docs/model.md).
 
-alpha starts as the regularised least squares fit of the frame's flow,
+alpha starts as the regularised least squares fit of a flow to the frame,
 
     min_a  sum_p w_f(p) |C(p) - sum_i a_i C_i(p)|^2 + r |a|^2,
 
@@ -15,6 +15,7 @@ on the prototypes warped along C_syn(alpha), as synthesis warps them.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import daqp
@@ -25,8 +26,8 @@ from scipy.linalg import cho_factor, cho_solve
 from mmmgpu.backends import Backend
 from mmmgpu.basis import LIP, MOUTH, Basis, around, cut
 from mmmgpu.errors import InputError
-from mmmgpu.flows import Matcher, best_flow, matcher, pull
-from mmmgpu.synthesis import NO_TEXTURE, warp_prototypes
+from mmmgpu.flows import Matcher, concatenate, matcher, pull
+from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -36,7 +37,8 @@ STEP_RIDGE = 3e-4  # the same for a Gauss-Newton step
 TEXTURE_RIDGE = 1e-6  # the same for beta: makes the programme strictly convex
 STEPS = 2  # Gauss-Newton steps
 OUTLIER = 0.2  # a pixel that differs by more than this counts less in a step
-WAYPOINTS = 1  # prototypes tried as waypoints of the flow to a frame
+LEAST = 16  # [px] width and height of a picture that flow is looked for in
+TINY = 1e-12  # least weight of a product of slopes
 NEAREST = 16  # prototypes that the first estimate of beta is made of
 STILL = 1e-6  # [px^2] mean square of a flow that is none
 THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are looked for
@@ -47,29 +49,34 @@ class Analyzer:
     """What analysis needs of a basis, computed once.
 
     basis: cut to the rectangle `inside` in which the masks are not zero.
+    kernels, held: the backend, and the prototypes on it.
     pixels: indices of the n reference pixels with w_f above 0.02; weight (n,): w_f there.
-    along_x, along_y: the prototype flows there, (n, M - 1) float32 each.
+    along: the prototype flows there, x above y, (2 n, M - 1).
     gram: Cholesky factor of the regularised Gram matrix of the flows.
-    energy: mean diagonal of the Gram matrix.
-    texture_pixels: indices of the pixels with w_t above 0.01; texture_weight: sqrt(w_t) there.
+    order: indices of all pixels, those with w_t above 0.01 first; textured: how many these are.
+    scale: sqrt(w_t) of these, 1 of the others, (h, w).
+    places, masked: each pixel's place in that order, (h, w), and the same with -1 for the others.
     thumbnails: small masked prototypes, (M, k).
     """
 
     basis: Basis
     inside: tuple[slice, slice]
     match: Matcher
+    kernels: Backend
+    held: Any
     pixels: NDArray[np.int64]
     weight: F32
-    along_x: F32
-    along_y: F32
+    along: F32
     gram: tuple[Floats, bool]
-    energy: float
-    texture_pixels: NDArray[np.int64]
-    texture_weight: F32
+    order: NDArray[np.int64]
+    textured: int
+    scale: F32
+    places: NDArray[np.int32]
+    masked: NDArray[np.int32]
     thumbnails: F32
 
 
-def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
+def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> Analyzer:
     """Compute what does not change from frame to frame; `flow` is one of `flows.MATCHERS`.
 
     Raises:
@@ -80,27 +87,33 @@ def prepare_analysis(basis: Basis, *, flow: str = "dis") -> Analyzer:
     pixels = np.flatnonzero(basis.w_f > LIP)
     weight = basis.w_f.ravel()[pixels]
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
-    x, y = moving[..., 0].T, moving[..., 1].T
-    gram = (x.T * weight) @ x + (y.T * weight) @ y
+    along = np.ascontiguousarray(moving.transpose(2, 1, 0).reshape(2 * len(pixels), -1))
+    weighted = along * np.sqrt(np.tile(weight, 2))[:, None]
+    gram = weighted.T @ weighted
     energy = float(np.trace(gram)) / len(gram)
     if energy < STILL * float(weight.sum()):
         raise InputError(
             "the mouth never moves in the prototypes; give clips of speech, or --region X,Y,W,H"
         )
     regular = gram.astype(np.float64) + FLOW_RIDGE * energy * np.eye(len(gram))
-    texture = np.flatnonzero(basis.w_t > MOUTH)
+    textured = basis.w_t > MOUTH
+    order = np.argsort(~textured.ravel(), kind="stable")
+    places = np.argsort(order).astype(np.int32).reshape(basis.w_t.shape)
     return Analyzer(
         basis=basis,
         inside=inside,
         match=matcher(flow),
+        kernels=kernels,
+        held=kernels.hold_prototypes(basis.images, basis.flows, HOLE),
         pixels=pixels,
         weight=weight,
-        along_x=np.ascontiguousarray(x),
-        along_y=np.ascontiguousarray(y),
+        along=along,
         gram=cho_factor(regular),
-        energy=energy,
-        texture_pixels=texture,
-        texture_weight=np.sqrt(basis.w_t.ravel()[texture]),
+        order=order,
+        textured=int(textured.sum()),
+        scale=np.where(textured, np.sqrt(basis.w_t), np.float32(1)),
+        places=places,
+        masked=np.where(textured, places, np.int32(-1)),
         thumbnails=np.stack([thumbnail(image, basis.w_t) for image in basis.images]),
     )
 
@@ -118,77 +131,127 @@ def thumbnail(image: F32, mask: F32) -> F32:
     return np.asarray(small, np.float32).ravel()
 
 
-def analyze(analyzer: Analyzer, image: F32, kernels: Backend) -> tuple[Floats, Floats]:
+def analyze(analyzer: Analyzer, image: F32) -> tuple[Floats, Floats]:
     """(alpha (M - 1,), beta (M,)) of a region `image`, (h, w, 3) in [0, 1]."""
     image = np.ascontiguousarray(image[analyzer.inside])
     small = thumbnail(image, analyzer.basis.w_t)
     order = np.argsort(((analyzer.thumbnails - small) ** 2).sum(axis=1))
-    alpha = fit_flow(analyzer, _flow_to(analyzer, image, order))
+    alpha = fit_flow(analyzer, _flow_to(analyzer, image, int(order[0])))
     used = np.sort(order[:NEAREST])
     for _ in range(STEPS):
-        beta, made = _fit_texture(analyzer, image, alpha, used, kernels)
-        alpha = _refine(analyzer, image, alpha, made)
+        flow = analyzer.basis.flow(alpha)
+        beta, made = _fit_texture(analyzer, image, flow, used)
+        alpha = _refine(analyzer, image, alpha, flow, made)
         used = np.flatnonzero(beta > NO_TEXTURE)
     every = np.arange(len(analyzer.thumbnails))
-    return alpha, _fit_texture(analyzer, image, alpha, every, kernels)[0]
+    flow = analyzer.basis.flow(alpha)
+    warped = _warped(analyzer, flow, every, analyzer.masked, analyzer.textured)
+    return alpha, _fit_beta(analyzer, image, warped, every)
 
 
-def _flow_to(analyzer: Analyzer, image: F32, order: NDArray[np.int64]) -> F32:
-    """Flow from the reference to `image`, direct or through the first prototypes of `order`."""
-    basis = analyzer.basis
-    near = [i for i in order[: WAYPOINTS + 1] if i != basis.reference][:WAYPOINTS]
-    via = [(basis.images[i], basis.flows[i]) for i in near]
-    return best_flow(basis.images[basis.reference], image, basis.w_t, via, analyzer.match)
+def _flow_to(analyzer: Analyzer, image: F32, nearest: int) -> F32:
+    """Flow from the reference to `image` by way of the prototype that resembles it most.
+
+    Pictures of half the size do for a beginning.
+    """
+    basis, (h, w) = analyzer.basis, image.shape[:2]
+    size = (max(LEAST, (w + 1) // 2), max(LEAST, (h + 1) // 2))
+    a, b = (_resized(i, size) for i in (basis.images[nearest], image))
+    unit = np.array([w / size[0], h / size[1]], np.float32)
+    flow = _resized(analyzer.match(a, b), (w, h)) * unit
+    return concatenate(basis.flows[nearest], flow)
+
+
+def _resized(field: F32, size: tuple[int, int]) -> F32:
+    """A field (h, w, C) at another size (width, height)."""
+    return np.asarray(cv2.resize(field, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def fit_flow(analyzer: Analyzer, flow: F32) -> Floats:
     """alpha (M - 1,) of a flow from the reference, (h, w, 2) [px]."""
     at = flow.reshape(-1, 2)[analyzer.pixels] * analyzer.weight[:, None]
-    right = at[:, 0] @ analyzer.along_x + at[:, 1] @ analyzer.along_y
-    alpha: Floats = cho_solve(analyzer.gram, right.astype(np.float64))
+    alpha: Floats = cho_solve(analyzer.gram, (at.T.ravel() @ analyzer.along).astype(np.float64))
     return alpha
 
 
-def _refine(analyzer: Analyzer, image: F32, alpha: Floats, made: F32) -> Floats:
+def _refine(analyzer: Analyzer, image: F32, alpha: Floats, flow: F32, made: F32) -> Floats:
     """One Gauss-Newton step of alpha on the difference between its synthesis `made` and `image`.
 
     With e = I - I_syn and g = grad I, both read at p + C_syn(p), and weights w(p):
         (sum_p w C_i' (g g') C_j + r) da_j = -sum_p w C_i' g e - r a_i.
     """
-    basis = analyzer.basis
     mean = (made + image) / 2
-    slopes = [np.asarray(cv2.Scharr(mean, -1, *axis)) / 32 for axis in ((1, 0), (0, 1))]
-    flow = basis.flow(alpha)
-    fields = [np.asarray(field, np.float32) for field in (image - made, *slopes)]
-    error, gx, gy = (_pulled(analyzer, field, flow) for field in fields)
-    w = analyzer.weight / (1 + (error**2).sum(axis=1) / OUTLIER**2)
-    xx, xy, yy = ((w * (a * b).sum(axis=1))[:, None] for a, b in ((gx, gx), (gx, gy), (gy, gy)))
-    x, y = analyzer.along_x, analyzer.along_y
-    normal = x.T @ (xx * x + xy * y) + y.T @ (xy * x + yy * y)
-    right = (w * (gx * error).sum(axis=1)) @ x + (w * (gy * error).sum(axis=1)) @ y
+    slopes = [cv2.Scharr(mean, -1, *axis) / 32 for axis in ((1, 0), (0, 1))]
+    error, gx, gy = (_pulled(analyzer, f, flow) for f in (image - made, *slopes))
+    w = analyzer.weight / (1 + _dot(error, error) / OUTLIER**2)
+    xx, xy, yy = (w * _dot(a, b) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
+    rows = _rooted(xx, xy, yy, *np.split(analyzer.along, 2))
+    normal = rows.T @ rows
+    right = np.concatenate([w * _dot(g, error) for g in (gx, gy)]) @ analyzer.along
     ridge = STEP_RIDGE * float(np.trace(normal)) / len(normal)
     regular = normal.astype(np.float64) + ridge * np.eye(len(normal))
     step: Floats = cho_solve(cho_factor(regular), -right - ridge * alpha)
     return alpha + step
 
 
+def _dot(a: F32, b: F32) -> F32:
+    """Sums over the channels of a b, (n, 3) -> (n,)."""
+    return np.asarray(np.einsum("nc,nc->n", a, b))
+
+
+def _rooted(xx: F32, xy: F32, yy: F32, x: F32, y: F32) -> F32:
+    """Rows (2 n, m) with which rows' rows = sum_p C' (xx xy; xy yy) C, for C = (x, y), (n, m) each.
+
+    They are R C for the Cholesky factors R' R of the 2 x 2 matrices.
+    """
+    top = np.sqrt(np.maximum(xx, TINY))
+    side = xy / top
+    rows = np.empty((2 * len(x), x.shape[1]), np.float32)
+    np.multiply(x, top[:, None], out=rows[: len(x)])
+    rows[: len(x)] += side[:, None] * y
+    np.multiply(y, np.sqrt(np.maximum(yy - side**2, 0))[:, None], out=rows[len(x) :])
+    return rows
+
+
 def _pulled(analyzer: Analyzer, field: F32, flow: F32) -> F32:
     """`field` (h, w, 3) read at p + flow(p) for the pixels of the analyzer, (n, 3)."""
-    seen = pull(field, flow)
-    return seen.reshape(-1, seen.shape[-1])[analyzer.pixels]
+    return pull(field, flow).reshape(-1, 3)[analyzer.pixels]
 
 
 def _fit_texture(
-    analyzer: Analyzer, image: F32, alpha: Floats, used: NDArray[np.int64], kernels: Backend
+    analyzer: Analyzer, image: F32, flow: F32, used: NDArray[np.int64]
 ) -> tuple[Floats, F32]:
     """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3)."""
-    basis = analyzer.basis
-    on_device = warp_prototypes(basis, basis.flow(alpha), used, kernels)
-    warped = kernels.to_host(on_device).reshape(len(used), -1, 3)
-    beta = np.zeros(len(basis.images))
-    beta[used] = fit_mixture(warped, image, analyzer.texture_pixels, analyzer.texture_weight)
-    made = beta[used].astype(np.float32) @ warped.reshape(len(used), -1)
-    return beta, made.reshape(image.shape)
+    warped = _warped(analyzer, flow, used, analyzer.places, len(analyzer.order))
+    beta = _fit_beta(analyzer, image, warped, used)
+    mixed = (beta[used].astype(np.float32) @ warped).reshape(-1, 3)
+    made = mixed[analyzer.places] / analyzer.scale[..., None]
+    return beta, made
+
+
+def _warped(
+    analyzer: Analyzer,
+    flow: F32,
+    used: NDArray[np.int64],
+    places: NDArray[np.int32],
+    count: int,
+) -> F32:
+    """The prototypes `used` (n,) along `flow`, scaled, at `count` places: (n, 3 count)."""
+    k = analyzer.kernels
+    given = (flow, used.astype(np.int32), places, analyzer.scale)
+    to, which, where, scale = map(k.to_device, given)
+    moved = k.move_prototypes(analyzer.held, to, which, where, scale, count)
+    return k.to_host(moved).reshape(len(used), 3 * count)
+
+
+def _fit_beta(analyzer: Analyzer, image: F32, warped: F32, used: NDArray[np.int64]) -> Floats:
+    """beta (M,), zero outside `used`; warped: what `_warped` gives."""
+    scaled = (image * analyzer.scale[..., None]).reshape(-1, 3)
+    wanted = scaled[analyzer.order[: analyzer.textured]].ravel()
+    a = warped[:, : len(wanted)]
+    beta = np.zeros(len(analyzer.thumbnails))
+    beta[used] = solve_simplex(a @ a.T, a @ wanted)
+    return beta
 
 
 def fit_mixture(warped: F32, image: F32, pixels: NDArray[np.int64], weight: F32) -> Floats:

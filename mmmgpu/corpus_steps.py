@@ -144,13 +144,13 @@ def analyse_corpus(
 def _analysing(shared: tuple[Path, Basis, str, str]) -> Work:
     """Keeps alpha and beta of every frame of a clip."""
     folder, basis, flow, backend = shared
-    analyzer, kernels = prepare_analysis(basis, flow=flow), get_backend(backend, 1)
+    analyzer = prepare_analysis(basis, get_backend(backend, 1), flow=flow)
 
     def work(item: tuple[Clip, Track], tick: Tick) -> None:
         clip, track = item
         alpha, beta = [], []
         for image in crops(clip.path, track, basis.region):
-            a, b = analyze(analyzer, image, kernels)
+            a, b = analyze(analyzer, image)
             alpha.append(a)
             beta.append(b)
             tick()

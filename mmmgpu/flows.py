@@ -86,6 +86,11 @@ def best_flow(
     """
     flows = [match(reference, image)]
     flows += [concatenate(to_waypoint, match(waypoint, image)) for waypoint, to_waypoint in via]
+    return best_of(reference, image, mask, flows)
+
+
+def best_of(reference: F32, image: F32, mask: F32, flows: Sequence[F32]) -> F32:
+    """That of several flows reference -> image which explains the image best."""
     errors = [explanation_error(reference, image, f, mask) for f in flows]
     return flows[int(np.argmin(errors))]
 
@@ -123,14 +128,12 @@ def path_to(target: int, before: NDArray[np.int64]) -> list[int]:
 
 
 def extend_flows(
-    flows: dict[int, F32], path: Sequence[int], images: Mapping[int, F32], match: Matcher
+    flows: dict[int, F32], path: Sequence[int], steps: Mapping[tuple[int, int], F32]
 ) -> None:
     """Add the flows from the first frame of `path` to all its frames that `flows` lacks.
 
-    They are concatenated step by step; paths of one tree share their steps.
+    They are concatenated from `steps`, flows between frames; paths of one tree share them.
     """
-    h, w = images[path[0]].shape[:2]
-    flows.setdefault(path[0], np.zeros((h, w, 2), np.float32))
     for a, b in pairwise(path):
         if b not in flows:
-            flows[b] = concatenate(flows[a], match(images[a], images[b]))
+            flows[b] = concatenate(flows[a], steps[a, b]) if a in flows else steps[a, b]

@@ -40,12 +40,11 @@ def analyse_clip(model: Model, clip: Path, *, backend: str = "warp") -> Analysed
         InputError: The clip cannot be read, or the model's head is not found in it.
     """
     track = track_clip(clip, model.reference)
-    analyzer = prepare_analysis(model.basis)
-    kernels = get_backend(backend, 1)
+    analyzer = prepare_analysis(model.basis, get_backend(backend, 1))
     region = model.basis.region
 
     def one(item: tuple[NDArray[np.uint8], Floats], _: Cancelled) -> tuple[Floats, Floats]:
-        return analyze(analyzer, crop(item[0], item[1], track, region), kernels)
+        return analyze(analyzer, crop(item[0], item[1], track, region))
 
     items = zip(read_frames(clip), track.poses, strict=False)
     found = map_ordered(one, items, threads=default_threads())

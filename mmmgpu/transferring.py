@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mmmgpu.backends import default_threads
 from mmmgpu.basis import MOUTH, Basis, around, make_basis, part_of, still_outside
 from mmmgpu.checkpoints import write_step
 from mmmgpu.corpora import Clip, open_corpus
@@ -32,9 +33,10 @@ from mmmgpu.corpus_steps import (
 )
 from mmmgpu.correspondence import Correspondence, rbf_correspondence
 from mmmgpu.errors import InputError
-from mmmgpu.flows import Matcher, best_flow, matcher
+from mmmgpu.flows import Matcher, best_flow, best_of, concatenate, matcher
 from mmmgpu.matching import BALANCE, Matching, View, match_prototypes
 from mmmgpu.models import Model
+from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.points import CLOSED, PointPair, check_frames, read_points
 from mmmgpu.processes import Tick, Work
 from mmmgpu.reference_pairs import pose_of
@@ -261,7 +263,11 @@ class _Transfer:
         origin = basis.images[self.marked[kind].prototype]
         closed = basis.images[basis.reference]
         via = [(closed, match(origin, closed))]
-        flows = [best_flow(origin, image, basis.w_t, via, match) for image in basis.images]
+
+        def one(image: F32, _: Cancelled) -> F32:
+            return best_flow(origin, image, basis.w_t, via, match)
+
+        flows = list(map_ordered(one, basis.images, threads=default_threads()))
         return still_outside(np.stack(flows), basis.cover)
 
     def _references(self, frames: Frames, region: Region) -> dict[str, F32]:
@@ -274,10 +280,15 @@ class _Transfer:
 
     def _basis(self, frames: Frames, region: Region, chosen: NDArray[np.int64]) -> Basis:
         """The basis of the frames of B that are number `chosen`, on the whole region."""
-        origins, match = self._references(frames, region), matcher(self.options.flow)
+        origins = self._references(frames, region)
         images = frames.crops(sorted({int(i) for i in chosen}), region)
-        flow_to = _flow_finder(origins, CLOSED, mouth_mask(region), match)
-        flows = {i: flow_to(image) for i, image in images.items()}
+        flows_to = _flow_finder(origins, mouth_mask(region), matcher(self.options.flow))
+
+        def one(image: F32, _: Cancelled) -> F32:
+            return flows_to(image)[CLOSED]
+
+        found = map_ordered(one, images.values(), threads=default_threads())
+        flows = dict(zip(images, found, strict=True))
         pictures, moved = (np.stack([found[int(i)] for i in chosen]) for found in (images, flows))
         return make_basis(pictures, moved, self.source.basis.reference, region)
 
@@ -349,26 +360,33 @@ def _images(frames: Frames, region: Region) -> F32:
 
 
 def _flow_finder(
-    origins: Mapping[str, F32], kind: str, mask: F32, match: Matcher
-) -> Callable[[F32], F32]:
-    """A function image -> flow from the reference `kind`: direct, or by another reference."""
-    origin = origins[kind]
-    via = [(image, match(origin, image)) for other, image in origins.items() if other != kind]
-    return lambda image: best_flow(origin, image, mask, via, match)
+    origins: Mapping[str, F32], mask: F32, match: Matcher
+) -> Callable[[F32], dict[str, F32]]:
+    """A function image -> flows from all references: direct, or by another reference."""
+    between = {(a, b): match(origins[a], origins[b]) for a in origins for b in origins if a != b}
+
+    def flows_to(image: F32) -> dict[str, F32]:
+        direct = {kind: match(origin, image) for kind, origin in origins.items()}
+        found = {}
+        for kind, origin in origins.items():
+            via = [concatenate(way, direct[b]) for (a, b), way in between.items() if a == kind]
+            found[kind] = best_of(origin, image, mask, [direct[kind], *via])
+        return found
+
+    return flows_to
 
 
 def _flowing(shared: tuple[Path, Region, Mapping[str, F32], F32, str]) -> Work:
     """Keeps the flows of every frame of a clip, from each reference."""
     folder, region, origins, mask, flow = shared
-    match = matcher(flow)
-    finders = {kind: _flow_finder(origins, kind, mask, match) for kind in origins}
+    flows_to = _flow_finder(origins, mask, matcher(flow))
 
     def work(item: tuple[Clip, Track], tick: Tick) -> None:
         clip, track = item
         flows: dict[str, list[F32]] = {kind: [] for kind in origins}
         for image in crops(clip.path, track, region):
-            for kind, flow_to in finders.items():
-                flows[kind].append(flow_to(image))
+            for kind, found in flows_to(image).items():
+                flows[kind].append(found)
             tick()
         write_step(folder, f"flow-{clip.path.name}", {k: np.stack(f) for k, f in flows.items()})
 

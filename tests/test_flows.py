@@ -158,18 +158,15 @@ def test_a_long_chain_is_walked_frame_by_frame():
     assert max(b - a for a, b in pairwise(path)) <= NEIGHBOURS
 
 
-def test_flows_of_a_tree_are_concatenated_step_by_step_and_matched_once():
-    images = {i: np.full((4, 5, 3), i, np.float32) for i in (3, 7, 8, 9)}
-    asked = []
-
-    def match(a, b):
-        asked.append((int(a[0, 0, 0]), int(b[0, 0, 0])))
-        return np.full((4, 5, 2), b[0, 0, 0] - a[0, 0, 0], np.float32)
-
+def test_flows_of_a_tree_are_concatenated_step_by_step():
+    pairs = [(3, 7), (7, 8), (7, 9)]
+    steps = {(a, b): np.full((4, 5, 2), b - a, np.float32) for a, b in pairs}
     flows = {}
-    extend_flows(flows, [3, 7, 8], images, match)
-    extend_flows(flows, [3, 7, 9], images, match)
-    extend_flows(flows, [3], images, match)
-    assert asked == [(3, 7), (7, 8), (7, 9)]
-    for i in images:
-        np.testing.assert_array_equal(flows[i], np.full((4, 5, 2), i - 3))
+    extend_flows(flows, [3, 7, 8], steps)
+    shared = flows[7]
+    extend_flows(flows, [3, 7, 9], steps)
+    extend_flows(flows, [3], steps)
+    assert flows[7] is shared
+    assert sorted(flows) == [7, 8, 9]
+    for i, flow in flows.items():
+        np.testing.assert_array_equal(flow, np.full((4, 5, 2), i - 3))

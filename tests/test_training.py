@@ -93,11 +93,11 @@ def test_the_reference_is_at_rest(world, trained):
 
 def test_frames_of_the_corpus_are_made_again(world, trained):
     model, kernels = trained[1], get_backend("warp")
-    analyzer = prepare_analysis(model.basis)
+    analyzer = prepare_analysis(model.basis, kernels)
     track = track_clip(world.clips[1], model.reference)
     errors = []
     for image in list(crops(world.clips[1], track, model.basis.region))[::6]:
-        made = synthesize_one(model.basis, *analyze(analyzer, image, kernels), kernels)
+        made = synthesize_one(model.basis, *analyze(analyzer, image), kernels)
         weight = model.basis.w_t[..., None]
         errors.append(float((weight * (made - image) ** 2).sum() / (3 * weight.sum())))
     assert -10 * np.log10(np.mean(errors)) > 28

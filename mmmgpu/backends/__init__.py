@@ -11,6 +11,8 @@ import importlib
 import os
 from typing import Any, Protocol, cast
 
+from numpy.typing import NDArray
+
 from mmmgpu.arrays import F32
 from mmmgpu.errors import InputError
 
@@ -30,7 +32,7 @@ class Backend(Protocol):
     The shapes are those of `mmmgpu.operations` with exactly one batch axis.
     """
 
-    def to_device(self, array: F32, /) -> Any:
+    def to_device(self, array: NDArray[Any], /) -> Any:
         """A device array of the same shape. It may share memory with `array`."""
 
     def to_host(self, array: Any, /) -> F32:
@@ -55,6 +57,30 @@ class Backend(Protocol):
         self, points: Any, centres: Any, weights: Any, affine: Any, sharpness: float, /
     ) -> Any:
         """(P, 2), (N, 2), (N, 2), (2, 3) -> (P, 2)."""
+
+    def hold_prototypes(self, images: F32, flows: F32, hole: float, /) -> Any:
+        """NumPy (M, H, W, 3), (M, H, W, 2): all of them that stays the same, on the device.
+
+        A pixel that receives less weight than `hole` in one of the two warps of CE05, Eq. 2, is
+        filled.
+        """
+
+    def move_prototypes(
+        self, held: Any, flow: Any, used: Any, places: Any, scale: Any, asked: int, /
+    ) -> Any:
+        """Some of what `hold_prototypes` gave, each moved along C_syn as in CE05, Eq. 2.
+
+        (H, W, 2), (n,) int32, (H, W) int32, (H, W) -> (n, P, 3). A pixel goes to its place, one of
+        the P = `asked` or -1 for none, times its scale.
+        """
+
+    def mix_prototypes(
+        self, held: Any, flows: Any, weights: Any, places: Any, scale: Any, asked: int, /
+    ) -> Any:
+        """CE05, Eq. 2: (B, H, W, 2), (B, M), (H, W) int32, (H, W) -> (B, P, 3).
+
+        A prototype costs nothing where its weight is 0; else as `move_prototypes`.
+        """
 
 
 def list_devices(family: str) -> dict[str, str]:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.arrays import check_some_valid
+from mmmgpu.arrays import F32, check_some_valid
+from mmmgpu.backends.orientation import orient
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
@@ -29,6 +30,24 @@ class Level:
     value: Any  # (B, h, w, C)
     weight: Any  # (B, h, w)
     threshold: float
+
+
+@dataclass(frozen=True)
+class Prototypes:
+    """Prototypes of height x width pixels on a device.
+
+    arrays: As the kernels of kernels/prototypes take them, from `images` to `row_shares`.
+    number, height, width: M and the size of a prototype.
+    nodes: See `mmmgpu.backends.orientation.Orientations`.
+    hole: Less weight makes a pixel a hole.
+    """
+
+    arrays: tuple[Any, ...]
+    number: int
+    height: int
+    width: int
+    nodes: int
+    hole: float
 
 
 @dataclass(frozen=True)
@@ -149,6 +168,64 @@ class Launches(ABC):
         self.launch_all("rbf.evaluate_rbf", math.ceil(number / LANES), inputs, [mapped])
         return mapped
 
+    def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
+        number, height, width, _ = images.shape
+        held = orient(flows, hole)
+        padded = np.ones((number, height, width, 4), np.float32)
+        padded[..., :3] = images
+        fixed = held.fixed, held.taps, held.shares
+        rows = held.rows, held.targets, held.starts, held.row_taps, held.row_shares
+        arrays = tuple(self.to_device(a) for a in (padded, *fixed, *rows))
+        return Prototypes(arrays, number, height, width, held.nodes, float(hole))
+
+    def move_prototypes(
+        self, held: Prototypes, flow: Any, used: Any, places: Any, scale: Any, asked: int
+    ) -> Any:
+        members = self.to_host(used)
+        alone = [np.arange(len(members) + 1), members, np.ones(len(members))]
+        return self._mixtures(held, flow, 1, alone, [places, scale], asked)
+
+    def mix_prototypes(
+        self, held: Prototypes, flows: Any, weights: Any, places: Any, scale: Any, asked: int
+    ) -> Any:
+        shares = self.to_host(weights)
+        parts = np.concatenate([[0], np.cumsum(np.count_nonzero(shares, axis=1))])
+        members = [parts, np.nonzero(shares)[1], shares[shares != 0]]
+        return self._mixtures(held, flows, len(shares), members, [places, scale], asked)
+
+    def _mixtures(
+        self,
+        held: Prototypes,
+        flows: Any,
+        frames: int,
+        members: list[Any],
+        where: list[Any],
+        asked: int,
+    ) -> Any:
+        """Run kernels/prototypes with an accumulator for every worker."""
+        mixtures, area = len(members[0]) - 1, held.height * held.width
+        mixed = self.empty(mixtures, asked, 3)
+        if not mixtures * asked:
+            return mixed
+        workers = min(self.workers, mixtures)
+        size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
+        arrived = self.empty(mixtures, dtype=np.int32)
+        given = zip(members, (np.int32, np.int32, np.float32), strict=True)
+        inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), *where]
+        inputs += [frames, mixtures, asked, held.height, held.width, size, held.nodes, held.hole]
+        inputs.append(workers)
+        outputs = [
+            self.empty(workers, area, 4),
+            self.empty(workers, size, 4),
+            self.empty(workers, area, dtype=np.int32),
+            self.empty(workers, held.nodes, 2),
+            mixed,
+            arrived,
+        ]
+        self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
+        check_some_valid(self.to_host(arrived))
+        return mixed
+
     def _coarser(self, level: Level) -> Level:
         """An uninitialised level of half the size; its weights are numbers of valid pixels."""
         batch, height, width, channels = level.value.shape
@@ -178,3 +255,12 @@ class Launches(ABC):
         planes = self.empty(count, channels, math.ceil(points / LANES) * LANES)
         self.launch("distance_scan.pack", first, count, [fields, points, channels], [planes])
         return planes
+
+
+def _pyramid(height: int, width: int) -> int:
+    """Pixels of all levels of a picture, each half as high and wide as the one before."""
+    size = height * width
+    while (height, width) != (1, 1):
+        height, width = (height + 1) // 2, (width + 1) // 2
+        size += height * width
+    return size

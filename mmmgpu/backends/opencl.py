@@ -82,6 +82,8 @@ class OpenCL(Launches):
     queue: Any
 
     def to_device(self, array: NDArray[Any]) -> Any:
+        if not array.size:  # there are no empty buffers
+            return self.empty(*array.shape, dtype=array.dtype)
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
         data = cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(array))
         return cl.array.Array(self.queue, array.shape, array.dtype, data=data)

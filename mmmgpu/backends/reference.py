@@ -5,12 +5,15 @@ fraction, the weights of the taps) is float32, as on every other backend.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.errors import InputError
+
+I32 = NDArray[np.int32]
 
 FAR = 1e8  # [px] beyond any picture, inside int32
 
@@ -28,10 +31,19 @@ def list_devices() -> dict[str, str]:
 
 
 @dataclass(frozen=True)
+class Prototypes:
+    """Pictures (M, H, W, 3), flows (M, H, W, 2), and the least weight of a pixel that is none."""
+
+    images: F32
+    flows: F32
+    hole: float
+
+
+@dataclass(frozen=True)
 class Reference:
     """The operations in plain NumPy; device arrays are NumPy arrays."""
 
-    def to_device(self, array: F32) -> F32:
+    def to_device(self, array: NDArray[Any]) -> NDArray[Any]:
         return array
 
     def to_host(self, array: F32) -> F32:
@@ -72,30 +84,72 @@ class Reference:
             mapped += phi[:, None] * weight
         return mapped.astype(np.float32)
 
+    def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
+        return Prototypes(images, flows, hole)
+
+    def move_prototypes(
+        self, held: Prototypes, flow: F32, used: I32, places: I32, scale: F32, asked: int
+    ) -> F32:
+        moved = np.empty((len(used), asked, 3), np.float32)
+        shown = np.flatnonzero(places >= 0)
+        for j, i in enumerate(used):
+            own = held.flows[i : i + 1]
+            oriented = self._filled_warp(flow[None] - own, own, held.hole)
+            seen = self._filled_warp(held.images[i : i + 1], oriented, held.hole)
+            scaled = seen[0] * scale[..., None]
+            moved[j, places.ravel()[shown]] = scaled.reshape(-1, 3)[shown]
+        return moved
+
+    def mix_prototypes(
+        self, held: Prototypes, flows: F32, weights: F32, places: I32, scale: F32, asked: int
+    ) -> F32:
+        mixed = np.zeros((len(flows), asked, 3), np.float32)
+        for b, (flow, share) in enumerate(zip(flows, weights, strict=True)):
+            used = np.flatnonzero(share).astype(np.int32)
+            moved = self.move_prototypes(held, flow, used, places, scale, asked)
+            mixed[b] = np.tensordot(share[used].astype(np.float64), moved, axes=1)
+        return mixed
+
+    def _filled_warp(self, field: F32, flow: F32, hole: float) -> F32:
+        return self.fill_holes(*self.forward_warp(field, flow), hole)
+
 
 def _splat(field: F32, flow: F32) -> tuple[F32, F32]:
     """Forward warp of one field (H, W, C) along one flow (H, W, 2)."""
     height, width, channels = field.shape
-    whole = np.floor(flow)
-    fraction = flow - whole  # float32
-    x, y = np.moveaxis(np.clip(whole, -FAR, FAR).astype(np.int64), -1, 0)
-    x = x + np.arange(width)
-    y = y + np.arange(height)[:, None]
-    total = np.zeros((height * width, channels + 1))
-    source = np.concatenate([field, np.ones_like(field[..., :1])], axis=-1, dtype=np.float64)
-    for dy, wy in enumerate((1 - fraction[..., 1], fraction[..., 1])):
-        for dx, wx in enumerate((1 - fraction[..., 0], fraction[..., 0])):
-            inside = (x + dx >= 0) & (x + dx < width) & (y + dy >= 0) & (y + dy < height)
-            target = ((y + dy) * width + x + dx)[inside]
-            arriving = (wx * wy)[inside][:, None] * source[inside]
-            for c in range(channels + 1):
-                total[:, c] += np.bincount(target, arriving[:, c], minlength=height * width)
+    target, source, share = landings(flow)
+    carried = np.concatenate([field, np.ones_like(field[..., :1])], axis=-1, dtype=np.float64)
+    arriving = share[:, None] * carried.reshape(-1, channels + 1)[source]
+    total = np.empty((height * width, channels + 1))
+    for c in range(channels + 1):
+        total[:, c] = np.bincount(target, arriving[:, c], minlength=height * width)
     weight = total[:, -1:]
     warped = total[:, :-1] / np.where(weight > 0, weight, 1)
     return (
         warped.reshape(field.shape).astype(np.float32),
         weight.reshape(height, width).astype(np.float32),
     )
+
+
+def landings(flow: F32) -> tuple[NDArray[np.int64], NDArray[np.int64], F32]:
+    """Where the pixels of a picture go along `flow` (H, W, 2): numbers of targets and sources.
+
+    A pixel has up to four targets; the third array is the share that each gets, float32.
+    """
+    height, width, _ = flow.shape
+    whole = np.floor(flow)
+    fraction = flow - whole  # float32
+    x, y = np.moveaxis(np.clip(whole, -FAR, FAR).astype(np.int64), -1, 0)
+    x = x + np.arange(width)
+    y = y + np.arange(height)[:, None]
+    taps = []
+    for dy, wy in enumerate((1 - fraction[..., 1], fraction[..., 1])):
+        for dx, wx in enumerate((1 - fraction[..., 0], fraction[..., 0])):
+            inside = (x + dx >= 0) & (x + dx < width) & (y + dy >= 0) & (y + dy < height)
+            target = (y + dy) * width + x + dx
+            taps.append((target[inside], np.flatnonzero(inside), (wx * wy)[inside]))
+    target, source, share = (np.concatenate(part) for part in zip(*taps, strict=True))
+    return target, source, share
 
 
 def _pull_push(field: F32, valid: NDArray[np.bool_]) -> F32:
