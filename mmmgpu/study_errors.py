@@ -1,15 +1,16 @@
 """Error measures of the clips of a study, to be put beside what people chose.
 
-They come from a table with a row for each condition, sentence and metric: CSV with these columns
-and `value`, or JSON, a list of such rows. Whether people agree with a measure is counted answer by
-answer: did they take the clip with the lower value for real?
+They come from `compare.json`, as `mmmgpu compare` writes it, whose `sentences` hold a value for
+each sentence, condition and metric; or from any CSV file with the columns condition, sentence,
+metric and value. Whether people agree with a measure is counted answer by answer: did they take the
+clip with the lower value for real?
 """
 
 import csv
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def read_errors(path: str | os.PathLike[str]) -> Errors:
     errors: dict[str, dict[tuple[str, str], float]] = {}
     for number, row in enumerate(_rows(Path(path)), start=1):
         where = f"{path}: row {number}"
-        values = [row.get(name) if isinstance(row, Mapping) else None for name in COLUMNS]
+        values = [row.get(name) for name in COLUMNS]
         if any(value is None for value in values):
             raise InputError(f"{where}: must have {', '.join(COLUMNS)}; add what is missing")
         condition, sentence, metric = (str(value) for value in values[:3])
@@ -45,20 +46,33 @@ def read_errors(path: str | os.PathLike[str]) -> Errors:
     return errors
 
 
-def _rows(path: Path) -> Iterable[Any]:
+def _rows(path: Path) -> Iterable[Mapping[str, Any]]:
     try:
         text = path.read_text("utf-8-sig")
-        rows = json.loads(text) if path.suffix.lower() == ".json" else None
+        values = json.loads(text) if path.suffix.lower() == ".json" else None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: is no table of errors ({reason}); correct it") from error
-    if rows is None:
+    if values is None:
         return csv.DictReader(text.splitlines())
-    if not isinstance(rows, list):
-        raise InputError(f"{path}: must be a list of rows with {', '.join(COLUMNS)}; correct it")
-    return rows
+    try:
+        return list(_compared(values["sentences"]))
+    except (AttributeError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: has no values by sentence, condition and metric; give the file that "
+            "mmmgpu compare wrote"
+        ) from error
+
+
+def _compared(sentences: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """A row for each value; null stands where a metric is not defined."""
+    for sentence, conditions in sentences.items():
+        for condition, metrics in conditions.items():
+            for metric, value in metrics.items():
+                if value is not None:
+                    yield dict(zip(COLUMNS, (condition, sentence, metric, value), strict=True))
 
 
 def _number(value: Any, where: str) -> float:

@@ -27,12 +27,19 @@ def test_a_table_is_read_by_metric_and_clip(errors):
     }
 
 
-def test_json_is_read_alike(tmp_path, errors):
-    header, *lines = (line.split(",") for line in TABLE.splitlines())
-    rows = [dict(zip(header, line, strict=True)) for line in lines]
-    rows[0]["value"] = 0.5
-    (tmp_path / "e.json").write_text(json.dumps(rows))
-    assert read_errors(tmp_path / "e.json") == errors
+def test_what_compare_writes_is_read(tmp_path, errors):
+    found = {
+        "models": {"dpds": {}},
+        "sentences": {
+            "set red": {
+                "dpds": {"L1": 0.5, "RMS": 1e-3, "log_likelihood": None},
+                "slds": {"L1": 2},
+            },
+            "lay blue": {"dpds": {"L1": 0.25}},
+        },
+    }
+    (tmp_path / "compare.json").write_text(json.dumps(found))
+    assert read_errors(tmp_path / "compare.json") == errors
 
 
 @pytest.mark.parametrize(
@@ -43,8 +50,10 @@ def test_json_is_read_alike(tmp_path, errors):
         ("e.csv", f"{TABLE}dpds,set red,L1,3,3\n", "row 5: a second L1 of 'set red' by 'dpds'"),
         ("e.csv", "condition,sentence,metric,value\na,b,L1,x\n", "must be a finite number, is 'x'"),
         ("e.csv", "condition,sentence,metric,value\na,b,L1,nan\n", "finite number, is 'nan'"),
-        ("e.json", '{"a": 1}', "must be a list of rows"),
-        ("e.json", "[1]", "row 1: must have"),
+        ("e.json", '{"a": 1}', "has no values by sentence"),
+        ("e.json", "[1]", "has no values by sentence"),
+        ("e.json", '{"sentences": {"s": {"c": 1}}}', "has no values by sentence"),
+        ("e.json", '{"sentences": {"s": {"c": {"L1": "x"}}}}', "must be a finite number, is 'x'"),
         ("e.json", "[", "is no table of errors"),
         ("e.json", "[" * 100_000, "is no table of errors"),
     ],

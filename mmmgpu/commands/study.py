@@ -234,8 +234,8 @@ def results(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Error measures of the clips, to be put beside the votes: CSV (or JSON) with "
-            "condition, sentence, metric and value, as written by: mmmgpu compare.",
+            help="Error measures of the clips, to be put beside the votes: compare.json of mmmgpu "
+            "compare, or CSV with the columns condition, sentence, metric and value.",
         ),
     ] = None,
     database: Database = None,

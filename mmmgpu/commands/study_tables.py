@@ -11,12 +11,15 @@ from mmmgpu.files import require_folder, write_text
 
 Value = Mapping[str, Any]
 TABLE = ("a", "prefer_a", "undecided", "prefer_b", "b")
-TITLES = ("A", "prefer A", "undecided", "prefer B", "B", "A of decided", "p", "p people")
+TABLE_TITLES = ("A", "prefer A", "undecided", "prefer B", "B")
+TEST_TITLES = ("A", "B", "A of decided", "p", "p (Holm)", "p (people)")
 
 
 def show_results(found: Value) -> None:
     """Print what `mmmgpu.study_results.study_results` found, as tables."""
-    show_table("Which one was taken for real", map(_row, found["table"]), TITLES)
+    counts = [[row[name] for name in TABLE] for row in found["table"]]
+    show_table("Which one was taken for real", counts, TABLE_TITLES)
+    show_table("Exact tests", map(_tests, found["table"]), TEST_TITLES)
     _show_scale(found["scale"])
     for metric, about in found.get("errors", {}).items():
         _show_errors(metric, about)
@@ -28,11 +31,12 @@ def show_results(found: Value) -> None:
     print(f"failed attention checks: {failed}{'; left out' if people['excluded'] else ''}")
 
 
-def _row(row: Value) -> list[object]:
+def _tests(row: Value) -> list[str]:
     share = "-"
     if row["share_a"] is not None:
         share = f"{row['share_a']:.0%} ({row['low']:.0%} .. {row['high']:.0%})"
-    return [*(row[name] for name in TABLE), share, f"{row['p_holm']:.2g}", f"{row['p_people']:.2g}"]
+    p = [f"{row[name]:.2g}" for name in ("p", "p_holm", "p_people")]
+    return [row["a"], row["b"], share, *p]
 
 
 def _show_scale(scale: Value) -> None:
