@@ -33,6 +33,7 @@ from mmmgpu.web_pages import strict_headers
 
 LARGEST_BODY = 1000  # bytes of a request
 BACKLOG = 1000  # connections that wait to be accepted
+KEEP_ALIVE_S = 75  # of a silent connection: longer than a pair takes
 CLOSING_S = 1  # for requests that are being answered when the server ends
 PAGE_FILES = {"study.css": "text/css", "study.js": "text/javascript"}
 HEADERS = strict_headers(
@@ -222,6 +223,7 @@ def serving(application: ASGIApp, *, host: str, port: int) -> Iterator[int]:
         server_header=False,
         ws="none",
         lifespan="off",
+        timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=CLOSING_S,
     )
     server = uvicorn.Server(settings)
