@@ -55,6 +55,10 @@ def test_help_names_every_command(mmmgpu):
     assert "..." not in words.partition("Commands:")[2]
 
 
+def test_the_study_is_among_the_commands(capfd):
+    assert "\n  study " in run_command(capfd, "--help").out
+
+
 def test_create_says_where_the_study_is_and_what(mmmgpu, clips, tmp_path):
     (tmp_path / "intro.txt").write_text("Wählen Sie.\n")
     options = ("--participants", 3, "--pairs", 5, "--checks", 1, "--seed", 7, "--mute")

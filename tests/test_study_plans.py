@@ -78,6 +78,14 @@ def test_order_and_sentences_are_random():
     assert len(together) > 0.9 * 20 * 14
 
 
+@pytest.mark.parametrize("number", [3, 7])
+def test_every_pair_meets_every_sentence(number):
+    plan = draw(sentences=SAID[:number], participants=100)
+    met = Counter((p.sentence, p.left, p.right) for pairs in plan for p in pairs)
+    assert len(met) == number * 14
+    assert max(met.values()) < 4 * min(met.values())
+
+
 def test_the_seed_decides():
     assert draw(seed=3) == draw(seed=3)
     assert draw(seed=3) != draw(seed=4)
