@@ -17,6 +17,7 @@ from mmmgpu.commands import (
     mark,
     reconstruct,
     speak,
+    study,
     train,
     transfer,
 )
@@ -67,6 +68,7 @@ for _command, _example in (
     (info.info, info.EXAMPLE),
 ):
     app.command(epilog=_example)(guarded(_command))
+app.add_typer(study.app, name="study")
 
 
 def main() -> None:

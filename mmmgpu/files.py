@@ -8,6 +8,7 @@ import errno
 import json
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,6 +54,31 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise InputError(f"cannot write {target}: {_REMEDIES[error.errno]}") from error
     finally:
         _remove(temporary)
+
+
+@contextmanager
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a new folder to fill; on success it becomes `path`, otherwise it is removed.
+
+    Raises:
+        InputError: There is something at `path` already that is no empty folder, or a new folder
+            cannot be made there.
+    """
+    target = Path(path)
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise InputError(f"{target}: exists already; choose another name, or take it away")
+    require_folder(target.absolute().parent)
+    temporary = _temporary(target)
+    try:
+        temporary.mkdir()
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        if error.errno not in _REMEDIES or not _is_about(error, temporary):
+            raise
+        raise InputError(f"cannot write {target}: {_REMEDIES[error.errno]}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:

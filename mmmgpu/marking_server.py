@@ -5,10 +5,8 @@ without which nothing is answered, and the Host header must be its own, so that 
 can reach it (DNS rebinding). Nothing from outside is ever loaded.
 """
 
-import ipaddress
 import json
 import secrets
-import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,8 +20,8 @@ from numpy.typing import NDArray
 
 from mmmgpu.errors import InputError
 from mmmgpu.marking import Session, StaleError, folded_points, warped_onto
+from mmmgpu.web_pages import LOOPBACK, strict_headers
 
-LOOPBACK = str(ipaddress.IPv4Address(socket.INADDR_LOOPBACK))
 LARGEST_BODY = 1_000_000  # bytes of a request
 PAGE_FILES = {
     "": ("mark.html", "text/html; charset=utf-8"),
@@ -33,15 +31,14 @@ PAGE_FILES = {
         for name in ("keeper.js", "mark.js", "marks.js", "view.js")
     },
 }
-HEADERS = {
-    "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
+HEADERS = strict_headers(
+    {
+        "script-src": "'self'",
+        "style-src": "'self'",
+        "img-src": "'self' blob: data:",
+        "connect-src": "'self'",
+    }
+)
 Answer = tuple[str, bytes]  # content type, content
 JSON_TYPE, PNG_TYPE = "application/json", "image/png"
 

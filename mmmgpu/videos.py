@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 
+VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
 STANDARD_RATES = (
     *(Fraction(1000 * n, 1001) for n in (24, 30, 60)),
     *(Fraction(n) for n in (10, 12, 15, 24, 25, 30, 50, 60, 100, 120)),

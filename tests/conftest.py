@@ -1,11 +1,17 @@
+import secrets
 import signal
 
 import hypothesis
+import psycopg
 import pytest
+from outside import missing, running_chromium
 from pairs import make_two_persons
+from postgres import find_programs, running
+from studied import write_clips
 from worlds import make_postures, make_world
 
 from mmmgpu.backends import BACKENDS, get_backend
+from mmmgpu.study_creation import StudyOptions, create_study
 
 hypothesis.settings.register_profile("busy", deadline=None)  # timing is not what is tested
 hypothesis.settings.load_profile("busy")
@@ -58,3 +64,42 @@ def face_and_basis():
 def basis(face_and_basis):
     """A small basis of mouth postures of a performer."""
     return face_and_basis[1]
+
+
+@pytest.fixture(scope="session")
+def study_folder(tmp_path_factory):
+    """A study of four conditions, three sentences and 50 participants; not to be changed."""
+    clips = write_clips(tmp_path_factory.mktemp("clips"))
+    out = tmp_path_factory.mktemp("studies") / "lips.study"
+    create_study(clips, out, options=StudyOptions(participants=50, seed=1))
+    return out
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """A real browser; see `outside`."""
+    with running_chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="session")
+def postgres_server():
+    """The socket's folder of a running PostgreSQL.
+
+    Without PostgreSQL its tests are skipped; where MMMGPU_REQUIRE_POSTGRES=1 that is a failure.
+    """
+    programs = find_programs()
+    if programs is None:
+        missing("no PostgreSQL on this machine", "MMMGPU_REQUIRE_POSTGRES")
+    with running(programs) as folder:
+        yield folder
+
+
+@pytest.fixture
+def postgres_url(postgres_server):
+    """The URL of an empty PostgreSQL database."""
+    name = f"study_{secrets.token_hex(4)}"
+    place = f"host={postgres_server} user=study dbname=postgres"
+    with psycopg.connect(place, autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}")
+    return f"postgresql://study@/{name}?host={postgres_server}"

@@ -6,6 +6,7 @@ import pytest
 
 from mmmgpu.errors import InputError
 from mmmgpu.files import (
+    atomic_folder,
     atomic_path,
     read_text,
     require_folder,
@@ -153,3 +154,63 @@ def test_text_is_read_without_its_mark(tmp_path):
         read_text(tmp_path / "a")
     with pytest.raises(InputError, match=r"b: cannot be read"):
         read_text(tmp_path / "b")
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_the_folder_appears_at_the_end(tmp_path, exists):
+    target = tmp_path / "new" / "folder"
+    if exists:
+        target.mkdir(parents=True)
+    with atomic_folder(target) as temporary:
+        (temporary / "a").write_text("x")
+        assert temporary.parent == target.parent
+        assert exists or not target.exists()
+    assert [p.name for p in target.parent.iterdir()] == ["folder"]
+    assert (target / "a").read_text() == "x"
+
+
+@pytest.mark.parametrize("error", [ValueError("x"), KeyboardInterrupt()])
+def test_of_a_failed_folder_nothing_is_left(tmp_path, error):
+    def interrupted():
+        with atomic_folder(tmp_path / "a") as temporary:
+            (temporary / "b").write_text("half")
+            raise error
+
+    with pytest.raises(type(error)) as caught:
+        interrupted()
+    assert caught.value is error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["file", "full folder"])
+def test_a_folder_replaces_nothing(tmp_path, what):
+    target = tmp_path / "a"
+    if what == "file":
+        target.write_text("old")
+    else:
+        write_text(require_folder(target) / "b", "old")
+    with pytest.raises(InputError, match="exists already"), atomic_folder(target):
+        pass
+    assert (target if what == "file" else target / "b").read_text() == "old"
+
+
+def test_a_folder_inside_a_file_is_refused(tmp_path):
+    (tmp_path / "a").write_text("")
+    with (
+        pytest.raises(InputError, match="cannot create the folder"),
+        atomic_folder(tmp_path / "a" / "b"),
+    ):
+        pass
+
+
+def test_a_full_disk_is_one_line_about_the_folder(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("os.replace", full)
+    with (
+        pytest.raises(InputError, match=r"cannot write .*a: the disk is full"),
+        atomic_folder(tmp_path / "a"),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []

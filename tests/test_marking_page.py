@@ -4,8 +4,6 @@ Without one these tests are skipped; where MMMGPU_REQUIRE_BROWSER=1 that is a fa
 """
 
 import base64
-import os
-import shutil
 from dataclasses import dataclass
 
 import cv2
@@ -17,30 +15,7 @@ from mmmgpu.marking import NAMES, Session, warped_onto
 from mmmgpu.marking_server import MarkingServer, serving
 from mmmgpu.points import read_points
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 WINDOW = {"width": 1280, "height": 720}
-
-
-def missing(what):
-    if os.environ.get("MMMGPU_REQUIRE_BROWSER") == "1":
-        pytest.fail(f"{what}, and MMMGPU_REQUIRE_BROWSER=1")
-    pytest.skip(what)
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        missing("no Chromium on this machine")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        missing("Playwright is not installed")
-    with sync_playwright() as playwright:
-        options = ["--no-sandbox", "--disable-dev-shm-usage"]
-        browser = playwright.chromium.launch(executable_path=path, args=options)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -13,8 +13,9 @@ from marked import shown_frames
 
 from mmmgpu.errors import InputError
 from mmmgpu.marking import Session, warped_onto
-from mmmgpu.marking_server import LARGEST_BODY, LOOPBACK, PAGE_FILES, MarkingServer, serving
+from mmmgpu.marking_server import LARGEST_BODY, PAGE_FILES, MarkingServer, serving
 from mmmgpu.points import read_points
+from mmmgpu.web_pages import LOOPBACK
 
 PAGE = resources.files("mmmgpu.marking_page")
 

@@ -22,8 +22,9 @@ def test_wheel_has_every_kernel(tmp_path):
     shipped = set(zipfile.ZipFile(wheel).namelist())
     sources = [f for f in (ROOT / "kernels").iterdir() if f.suffix in {".py", ".cl"}]
     assert {f"mmmgpu/kernels/{f.name}" for f in sources} <= shipped
-    page = (ROOT / "mmmgpu" / "marking_page").iterdir()
-    shown = {f.name for f in page if f.suffix in {".css", ".html", ".js"}}
-    assert {"mark.html", "mark.css", "mark.js"} <= shown
-    assert {f"mmmgpu/marking_page/{name}" for name in shown} <= shipped
+    for page, stem in (("marking_page", "mark"), ("study_page", "study")):
+        files = (ROOT / "mmmgpu" / page).iterdir()
+        shown = {f.name for f in files if f.suffix in {".css", ".html", ".js"}}
+        assert {f"{stem}.html", f"{stem}.css", f"{stem}.js"} <= shown
+        assert {f"mmmgpu/{page}/{name}" for name in shown} <= shipped
     assert not any(name.startswith("kernels/") for name in shipped)

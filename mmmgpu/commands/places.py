@@ -6,8 +6,6 @@ from pathlib import Path
 from mmmgpu.errors import InputError
 from mmmgpu.files import require_writable, write_json
 
-VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
-
 
 def videos_in(places: Iterable[Path]) -> list[Path]:
     """The clips at `places`: files as they are, of folders the videos in them, by name.
@@ -15,6 +13,8 @@ def videos_in(places: Iterable[Path]) -> list[Path]:
     Raises:
         InputError: A folder has no video in it.
     """
+    from mmmgpu.videos import VIDEO_SUFFIXES
+
     clips: list[Path] = []
     for place in places:
         found = [place]
