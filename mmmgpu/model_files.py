@@ -179,7 +179,7 @@ def _facts(model: Model) -> dict[str, Any]:
         "beta": _stream_facts(model.beta),
         "alternatives": sorted(model.alternatives),
         "dynamics": {
-            name: [facts_of(one) for one in pair] for name, pair in sorted(model.dynamics.items())
+            name: [facts_of(one) for one in pair] for name, pair in model.dynamics.items()
         },
         "notes": model.notes,
     }
