@@ -105,7 +105,7 @@ def check_sequence(
         wanted = f"(T, {'d' if d is None else d})"
         raise InputError(
             f"{name}: must have shape {wanted} with at least one frame, got {y.shape}; "
-            "leave out what is empty"
+            "leave this one out"
         )
     if len(y) != len(labels):
         raise InputError(
