@@ -126,12 +126,12 @@ def row_finder(known: Sequence[str]) -> Callable[[str], int]:
     (`mmmgpu.phones.stand_in`) if it is a phone and some known label is one, else the pooled row P.
     """
     row = {label: p for p, label in enumerate(known)}
-    phones = frozenset(label for label in known if arpabet(label) is not None)
 
     def find(label: str) -> int:
         if label not in row:
-            known_phone = bool(phones) and arpabet(label) is not None
-            row[label] = row[stand_in(label, phones)] if known_phone else len(known)
+            phones = frozenset(other for other in known if arpabet(other) is not None)
+            is_phone = bool(phones) and arpabet(label) is not None
+            row[label] = row[stand_in(label, phones)] if is_phone else len(known)
         return row[label]
 
     return find
