@@ -66,8 +66,8 @@ def load(path: str | os.PathLike[str]) -> Model:
         _check_facts(path, facts)
         _check_tensors(path, tensors, facts)
         return _assemble(tensors, facts)
-    except InputError as e:
-        raise e if str(path) in str(e) else InputError(f"{path}: {e}; train it again") from e
+    except InputError:
+        raise
     except (SafetensorError, OSError) as e:
         raise InputError(f"{path}: truncated, damaged or not a model ({e}); train it again") from e
     except (LookupError, TypeError, ValueError, AttributeError) as e:  # of a header like no other
@@ -269,10 +269,13 @@ def _dynamics(t: Tensors, facts: dict[str, Any]) -> dict[str, tuple[Dynamics, Dy
         for stream, said in zip(STREAMS, pair, strict=True):
             start = f"dynamics.{name}.{stream}."
             own = {n.removeprefix(start): x for n, x in t.items() if n.startswith(start)}
-            one = model_of(said, own)
+            try:
+                one = model_of(said, own)
+            except InputError as e:
+                raise ValueError(f"{start[:-1]}: {e}") from e  # `load` knows of which file
             d = len(next(iter(one.generate(one.labels[:1]))))
             if d != t[f"{stream}.smoothness"].size or said["model"] != name:
-                raise ValueError(f"dynamics {name} of {stream}")
+                raise ValueError(start[:-1])
             models.append(one)
         found[name] = (models[0], models[1])
     return found

@@ -209,7 +209,7 @@ MOVEMENTS = {
     "of other dimensions": (
         lambda t: {name: t[name][..., :-1] for name in t if name.startswith("dynamics.slds.alpha")},
         lambda f: {},
-        "dynamics slds of alpha",
+        "misstates dynamics.slds.alpha",
     ),
 }
 
