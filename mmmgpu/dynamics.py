@@ -103,7 +103,7 @@ def save_dynamics(model: Dynamics, path: str | os.PathLike[str]) -> None:
     from safetensors.numpy import save
 
     facts = {"format": FORMAT, "version": VERSION, **facts_of(model)}
-    tensors = {n: np.asarray(a, order="C") for n, a in tensors_of(model).items()}
+    tensors = {n: np.ascontiguousarray(a) for n, a in tensors_of(model).items()}
     write_bytes(path, save(tensors, metadata={HEADER: json.dumps(facts, ensure_ascii=False)}))
 
 

@@ -36,8 +36,8 @@ def tensor(*shapes: str, rule: str = "finite", dtype: str = "f8") -> Tensor:
     """What the array of an annotated field must be.
 
     Args:
-        shapes: Those it may have, a letter an axis: Q is P + 1 rows, d any one number, the same in
-            all fields. The empty string is a single number.
+        shapes: Those it may have, a letter an axis: Q is P + 1 rows, 1 is one, d any one number,
+            the same in all fields.
         rule: One of `RULES`.
         dtype: As NumPy writes it.
     """
@@ -86,7 +86,7 @@ def record_of(kind: type[Record], labels: Any, tensors: Mapping[str, Array]) -> 
         raise InputError("labels must be a row of strings")
     if len(set(labels)) != len(labels) or not labels:
         raise InputError("labels must be different from each other, and at least one")
-    sizes = {"Q": len(labels) + 1}
+    sizes = {"Q": len(labels) + 1, "1": 1}
     arrays: dict[str, Any] = {"labels": tuple(labels)}
     for name, wanted in _tensors(kind).items():
         if name not in tensors:

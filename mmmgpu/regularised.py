@@ -38,14 +38,14 @@ class Regularised:
         labels: The P labels, sorted.
         mean, variance: mu, sigma2 [features, squared], shape (P + 1, d).
         smoothness: lambda [1/features squared], shape (d,).
-        order: k, one number.
+        order: k, shape (1,).
     """
 
     labels: tuple[str, ...]
     mean: Annotated[Floats, tensor("Qd")]
     variance: Annotated[Floats, tensor("Qd", rule="above zero")]
     smoothness: Annotated[Floats, tensor("d", rule="above zero")]
-    order: Annotated[NDArray[np.int64], tensor("", rule="above zero", dtype="i8")]
+    order: Annotated[NDArray[np.int64], tensor("1", rule="above zero", dtype="i8")]
     comparable: ClassVar[bool] = False
 
     @classmethod
@@ -76,7 +76,7 @@ class Regularised:
             np.concatenate([stream.trained.mean, mean[-1:]]),
             np.concatenate([stream.trained.variance, variance[-1:]]),
             stream.smoothness,
-            np.array(stream.constants.order),
+            np.array([stream.constants.order]),
         )
 
     def generate(self, labels: Iterable[str]) -> Iterator[Floats]:
@@ -85,5 +85,5 @@ class Regularised:
         models = PhonemeModels(names, self.mean, self.variance, np.ones(len(names), np.int64))
         said = [names[p] for p in find_rows(self.labels, labels)]
         yield from synthesize_trajectory(
-            models, said, smoothness=self.smoothness, order=int(self.order)
+            models, said, smoothness=self.smoothness, order=int(self.order[0])
         )

@@ -17,7 +17,7 @@ class Thing:
     spread: Annotated[np.ndarray, tensor("Qd", "Qdd", rule="definite")]
     A: Annotated[np.ndarray, tensor("Qd", "Qdd", rule="stable")]
     scale: Annotated[np.ndarray, tensor("d", rule="above zero")]
-    order: Annotated[np.ndarray, tensor("", dtype="i8")]
+    order: Annotated[np.ndarray, tensor("1", dtype="i8")]
 
 
 def good(*, full=False):
@@ -28,7 +28,7 @@ def good(*, full=False):
         "spread": root @ root.swapaxes(1, 2) + np.eye(2) if full else np.ones((3, 2)),
         "A": np.full((3, 2, 2), 0.4) if full else np.full((3, 2), -0.9),
         "scale": np.ones(2),
-        "order": np.array(4),
+        "order": np.array([4]),
     }
 
 
@@ -56,7 +56,7 @@ FAULTS = {
     "A of 1": ({"A": np.ones((3, 2))}, "A must be below 1"),
     "eigenvalue of 1": ({"A": np.full((3, 2, 2), 0.5)}, "A must be below 1"),
     "zero": ({"scale": np.array([1.0, 0.0])}, "scale must be above zero"),
-    "a row for a number": ({"order": np.array([4])}, r"order must be int64 \(\)"),
+    "a number for a row": ({"order": np.array(4)}, r"order must be int64 \(1\)"),
 }
 
 

@@ -41,7 +41,7 @@ def test_the_trajectory_is_that_of_a_dense_solve_and_unseen_labels_are_pooled(da
             {k: m[p, j] for k, p in rows.items()} for m in (model.mean, model.variance)
         )
         want = dense_trajectory(
-            labels, [0, 1, 1, 2], mean, variance, model.smoothness[j], int(model.order)
+            labels, [0, 1, 1, 2], mean, variance, model.smoothness[j], int(model.order[0])
         )
         np.testing.assert_allclose(trajectory(model, labels)[:, j], want, rtol=1e-9)
     np.testing.assert_allclose(model.mean[-1], np.concatenate(data[0]).mean(axis=0), rtol=1e-12)
