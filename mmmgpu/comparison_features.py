@@ -51,6 +51,12 @@ class Features(Protocol):
         ...
 
 
+def _stats(folder: Path) -> list[list[str | int]]:
+    """Name, size and time of the files of numbers in `folder`."""
+    files = sorted(f for f in folder.glob("*") if f.suffix in (".npz", ".json"))
+    return [[f.name, f.stat().st_size, f.stat().st_mtime_ns] for f in files]
+
+
 @dataclass(frozen=True)
 class SavedFeatures:
     """``NAME.npz`` for every clip ``NAME.*`` in a folder, which holds `features` (T, d)."""
@@ -59,8 +65,7 @@ class SavedFeatures:
 
     def facts(self) -> dict[str, Any]:
         """Names, sizes and times of the files."""
-        stats = [(f.name, f.stat()) for f in sorted(self.folder.glob("*.npz"))]
-        return {"saved": [[name, s.st_size, s.st_mtime_ns] for name, s in stats]}
+        return {"saved": _stats(self.folder)}
 
     def learn(self, clips: Sequence[Clip], folder: Path, fold: int) -> SavedFeatures:
         """Nothing is to be learned."""
@@ -98,8 +103,8 @@ class AamFeatures:
     backend: str
 
     def facts(self) -> dict[str, Any]:
-        """Where the landmarks are."""
-        return {"aam": str(self.landmarks), "backend": self.backend}
+        """Names, sizes and times of the landmarks."""
+        return {"aam": _stats(self.landmarks), "backend": self.backend}
 
     def learn(self, clips: Sequence[Clip], folder: Path, fold: int) -> Eye:
         """An AAM of the clips."""
