@@ -95,6 +95,7 @@ def test_labels_that_start_nothing_or_are_never_entered_are_borrowed_for():
     model = Slds.fit(y, labels)
     b = np.concatenate([y[0][[1, 2, 4, 5]], y[1][[1, 3]]])
     np.testing.assert_allclose(model.mu[1], b.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(model.mu[-1], np.concatenate(y).mean(axis=0), rtol=1e-12)
     np.testing.assert_array_equal(model.A[2], model.A[-1])
     np.testing.assert_array_equal(model.Q[2], model.Q[-1])
     np.testing.assert_allclose(model.nu[2], (1 - model.A[2]) * model.mu[2], rtol=1e-12)
@@ -105,7 +106,7 @@ def test_the_covariance_nearest_in_likelihood_is_not_below_the_least():
     root = rng.normal(size=(3, 1))
     singular, least = root @ root.T, np.diag([0.1, 0.2, 0.3])
     got = at_least(singular[None, None], least[None, None])[0, 0]
-    assert np.linalg.eigvalsh(got - least).min() > -1e-12
+    np.testing.assert_allclose(np.linalg.eigvalsh(got - least).min(), 0, atol=1e-12)
 
     def value(c):  # log likelihood of a sample with covariance `singular`
         return -np.linalg.slogdet(c)[1] - np.trace(np.linalg.solve(c, singular))
