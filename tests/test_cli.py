@@ -78,6 +78,7 @@ def test_starting_loads_no_slow_library():
         ("speak", "m.mmm", "--out", "a.mp4"),
         ("speak", "m.mmm", "--out", "a.mp4", "--text", "hello", "--audio", "a.wav"),
         ("speak", "m.mmm", "--out", "a.mp4", "--from-trajectory", "t", "--articulation", "1.2"),
+        ("speak", "m.mmm", "--out", "a.mp4", "--from-trajectory", "t", "--trajectory", "dpds"),
         ("reconstruct", "m.mmm", "a.mp4", "--out", "b.mkv", "--landmarks", "."),
     ],
 )

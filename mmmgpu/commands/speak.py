@@ -117,9 +117,12 @@ def speak(
     require_output(json, [out, *inputs])
     from mmmgpu.backends import get_backend
     from mmmgpu.model_files import load
+    from mmmgpu.models import REGULARISED
     from mmmgpu.speaking import plan, render
     from mmmgpu.trajectory_files import read_trajectory, write_trajectory
 
+    if from_trajectory is not None and movement != REGULARISED:
+        raise typer.BadParameter("--from-trajectory has its own", param_hint="--trajectory")
     get_backend(backend)
     person = load(model)
     sound, phones = _voice(text, voice, alignment, audio, transcript)
