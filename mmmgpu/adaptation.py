@@ -24,6 +24,7 @@ from mmmgpu.corpus_steps import (
     Thumbnails,
     analyse_corpus,
     calmest,
+    fit_dynamics,
     make_model,
     rebased_frames,
     track_corpus,
@@ -188,14 +189,15 @@ class _Adaptation:
         analysed = analyse_corpus(
             self.folder, frames, basis, flow=options.flow, backend=self.backend
         )
+        spoken = [utterances_of(frames, z) for z in analysed]
         streams, others = [], []
         curves: dict[str, Any] = {}
-        for name, old, carried, z in zip(
-            ("alpha", "beta"), (model.alpha, model.beta), before, analysed, strict=True
+        for name, old, carried, utterances in zip(
+            ("alpha", "beta"), (model.alpha, model.beta), before, spoken, strict=True
         ):
             smoothness = scaled_smoothness(carried, old.constants.smoothness)
             start = replace(old, pooled=carried, trained=carried, smoothness=smoothness)
-            results = self._adapt(name, start, utterances_of(frames, z), classes)
+            results = self._adapt(name, start, utterances, classes)
             best = results[options.method]
             streams.append(_adapted_stream(start, best))
             others.append({method: found.models.mean for method, found in results.items()})
@@ -216,6 +218,7 @@ class _Adaptation:
                 for m in METHODS
                 if m not in ("none", options.method)
             },
+            dynamics=fit_dynamics(*spoken),
         )
 
     def _reselect(self, frames: Frames) -> tuple[NDArray[np.int64], Basis]:

@@ -11,6 +11,7 @@ from mmmgpu import __version__
 from mmmgpu.commands import (
     adapt,
     align,
+    compare,
     demo,
     evaluate,
     info,
@@ -62,6 +63,7 @@ for _command, _example in (
     (reconstruct.reconstruct, reconstruct.EXAMPLE),
     (speak.speak, speak.EXAMPLE),
     (evaluate.evaluate, evaluate.EXAMPLE),
+    (compare.compare, compare.EXAMPLE),
     (mark.mark, mark.EXAMPLE),
     (transfer.transfer, transfer.EXAMPLE),
     (adapt.adapt, adapt.EXAMPLE),

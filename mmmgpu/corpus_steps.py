@@ -25,8 +25,9 @@ from mmmgpu.checkpoints import (
     write_step,
 )
 from mmmgpu.corpora import Clip
+from mmmgpu.dynamics import MODELS, Dynamics
 from mmmgpu.errors import InputError
-from mmmgpu.models import Calm, Model
+from mmmgpu.models import REGULARISED, Calm, Model
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phonemes import Utterance
 from mmmgpu.processes import Tick, Work, share_out
@@ -263,6 +264,22 @@ def utterances_of(frames: Frames, coordinates: Sequence[Floats]) -> list[Utteran
         labels = clip.labels
         utterances.append(Utterance(z[good].astype(np.float64), [labels[t] for t in good]))
     return utterances
+
+
+def fit_dynamics(
+    alpha: Sequence[Utterance], beta: Sequence[Utterance]
+) -> dict[str, tuple[Dynamics, Dynamics]]:
+    """Of each stream, the models of movement other than `REGULARISED`, which is fitted apart."""
+    names = [name for name in MODELS if name != REGULARISED]
+    with progress_bar(2 * len(names), "fit other movements") as advance:
+
+        def fit(name: str, utterances: Sequence[Utterance]) -> Dynamics:
+            some = [u for u in utterances if len(u.z)]
+            model = MODELS[name].fit([u.z for u in some], [u.labels for u in some])
+            advance(1)
+            return model
+
+        return {name: (fit(name, alpha), fit(name, beta)) for name in names}
 
 
 def calmest(frames: Frames) -> Calm:

@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.basis import Basis
+from mmmgpu.dynamics import Dynamics, facts_of, model_of
 from mmmgpu.errors import InputError
 from mmmgpu.files import write_bytes
+from mmmgpu.flat_records import tensors_of
 from mmmgpu.models import Calm, Model
 from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.regions import Region
@@ -32,6 +34,7 @@ Tensors = dict[str, NDArray[Any]]
 HEADER = "mmmgpu"
 FORMAT = "mmmgpu-model"
 VERSION = 1
+STREAMS = ("alpha", "beta")
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
@@ -175,6 +178,9 @@ def _facts(model: Model) -> dict[str, Any]:
         "alpha": _stream_facts(model.alpha),
         "beta": _stream_facts(model.beta),
         "alternatives": sorted(model.alternatives),
+        "dynamics": {
+            name: [facts_of(one) for one in pair] for name, pair in model.dynamics.items()
+        },
         "notes": model.notes,
     }
 
@@ -220,6 +226,10 @@ def _tensors(model: Model) -> Tensors:
             tensors[f"{name}.covariance"] = stream.trained.covariance
     for other, (alpha, beta) in model.alternatives.items():
         tensors[f"alpha.{other}.mean"], tensors[f"beta.{other}.mean"] = alpha, beta
+    for movement, pair in model.dynamics.items():
+        for which, one in zip(STREAMS, pair, strict=True):
+            for part, tensor in tensors_of(one).items():
+                tensors[f"dynamics.{movement}.{which}.{part}"] = tensor
     return tensors
 
 
@@ -247,7 +257,28 @@ def _assemble(t: Tensors, facts: dict[str, Any]) -> Model:
             other: (t[f"alpha.{other}.mean"], t[f"beta.{other}.mean"])
             for other in facts["alternatives"]
         },
+        dynamics=_dynamics(t, facts),
     )
+
+
+def _dynamics(t: Tensors, facts: dict[str, Any]) -> dict[str, tuple[Dynamics, Dynamics]]:
+    """The other models of movement; none in files from before there were any."""
+    found = {}
+    for name, pair in facts.get("dynamics", {}).items():
+        models = []
+        for stream, said in zip(STREAMS, pair, strict=True):
+            start = f"dynamics.{name}.{stream}."
+            own = {n.removeprefix(start): x for n, x in t.items() if n.startswith(start)}
+            try:
+                one = model_of(said, own)
+            except InputError as e:
+                raise ValueError(f"{start[:-1]}: {e}") from e  # `load` knows of which file
+            d = len(next(iter(one.generate(one.labels[:1]))))
+            if d != t[f"{stream}.smoothness"].size or said["model"] != name:
+                raise ValueError(start[:-1])
+            models.append(one)
+        found[name] = (models[0], models[1])
+    return found
 
 
 def _stream(name: str, t: Tensors, facts: dict[str, Any]) -> TrainedStream:

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.basis import Basis
+from mmmgpu.dynamics import Dynamics, trajectory
+from mmmgpu.errors import InputError
 from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.phones import stand_in
 from mmmgpu.tracks import Reference, Track
@@ -19,6 +21,8 @@ from mmmgpu.trajectories import synthesize_trajectory
 from mmmgpu.trajectory_training import TrainedStream
 
 Floats = NDArray[np.float64]
+
+REGULARISED = "egp02"  # the trajectories of Eq. 3, which every model has
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Model:
     notes: what training found and chose, for reports; plain JSON values.
     alternatives: by name, the means (P, M - 1) and (P, M) that other ways of adaptation gave, for
         comparison; all else of the phoneme models is that of the trained ones.
+    dynamics: by name (`mmmgpu.dynamics.MODELS`), other models of alpha and of beta.
     """
 
     basis: Basis
@@ -61,6 +66,7 @@ class Model:
     calm: Calm
     notes: dict[str, Any] = field(default_factory=dict)
     alternatives: dict[str, tuple[Floats, Floats]] = field(default_factory=dict)
+    dynamics: dict[str, tuple[Dynamics, Dynamics]] = field(default_factory=dict)
 
     @property
     def frame_size(self) -> tuple[int, int]:
@@ -93,6 +99,35 @@ def trajectories(
         for models, stream in zip(phonemes_of(model, kind), (model.alpha, model.beta), strict=True)
     )
     return alpha, beta
+
+
+def moved_by(model: Model, labels: Sequence[str], movement: str) -> tuple[Floats, Floats]:
+    """alpha (T, M - 1) and beta (T, M) of a row of phones, T >= 1, by one of the model's movements.
+
+    movement: `REGULARISED`, or one of `model.dynamics`. In place of a phone that it has not seen
+        goes the one that looks most like it.
+
+    Raises:
+        InputError: The model has no such movement.
+    """
+    if movement == REGULARISED:
+        return trajectories(model, labels)
+    known = frozenset(labels_known(model, movement))
+    said = [stand_in(label, known) for label in labels]
+    alpha, beta = model.dynamics[movement]
+    return trajectory(alpha, said), trajectory(beta, said)
+
+
+def labels_known(model: Model, movement: str) -> tuple[str, ...]:
+    """The phones that one of the model's movements has seen; arguments and errors of `moved_by`."""
+    if movement == REGULARISED:
+        return model.alpha.trained.labels
+    if movement not in model.dynamics:
+        has = ", ".join([REGULARISED, *sorted(model.dynamics)])
+        raise InputError(
+            f"trajectory {movement!r}: the model has only {has}; use one of them or train it again"
+        )
+    return model.dynamics[movement][0].labels
 
 
 def phonemes_of(model: Model, kind: str = "trained") -> tuple[PhonemeModels, PhonemeModels]:

@@ -1,6 +1,8 @@
 """Speaking: from phones with times to a video of the model's person saying them.
 
 phones -> trajectories (Eq. 3) -> frame rate of the background -> images (Eq. 1-2) -> composite
+
+Trajectories may also come from the models of `mmmgpu.dynamics`.
 """
 
 import math
@@ -17,7 +19,7 @@ from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.backgrounds import Background, extended, open_background
 from mmmgpu.compositing import composite_matched
 from mmmgpu.errors import InputError
-from mmmgpu.models import Model, project_on_simplex, trajectories
+from mmmgpu.models import REGULARISED, Model, moved_by, project_on_simplex
 from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.phones import SIL
 from mmmgpu.progress import progress
@@ -40,6 +42,7 @@ def speak(
     out: str | os.PathLike[str],
     *,
     background: str | os.PathLike[str] | None = None,
+    movement: str = REGULARISED,
     articulation: float = 1.0,
     lossless: bool = False,
     backend: str = "warp",
@@ -51,14 +54,16 @@ def speak(
         speech: Sound and alignment: from `voices.say`, or a recording with its own.
         out: ``.mp4``, ``.mov`` or ``.mkv``.
         background: A clip of the person; None uses the one stored in the model.
+        movement: How phones become trajectories; see `models.moved_by`.
         articulation: Scales the movement about the silent mouth, 0.5 to 1.5.
         lossless: Exact RGB.
         backend: A name for `mmmgpu.backends.get_backend`.
 
     Raises:
-        InputError: The background cannot be read or registered, or `out` not be written.
+        InputError: The background cannot be read or registered, or `out` not be written; the model
+            has no such movement.
     """
-    trajectory = plan(model, speech.alignment, articulation=articulation)
+    trajectory = plan(model, speech.alignment, movement=movement, articulation=articulation)
     sound = (speech.samples, speech.rate)
     render(
         model,
@@ -72,11 +77,19 @@ def speak(
     return trajectory
 
 
-def plan(model: Model, alignment: Alignment, *, articulation: float = 1.0) -> Trajectory:
-    """The trajectory of `alignment` at the model's frame rate (Eq. 3), beta on the simplex.
+def plan(
+    model: Model,
+    alignment: Alignment,
+    *,
+    movement: str = REGULARISED,
+    articulation: float = 1.0,
+) -> Trajectory:
+    """The trajectory of `alignment` at the model's frame rate, beta on the simplex.
+
+    movement: Eq. 3, or another of the model's; see `models.moved_by`.
 
     Raises:
-        InputError: `articulation` is outside 0.5 to 1.5.
+        InputError: `articulation` is outside 0.5 to 1.5; the model has no such movement.
     """
     if not ARTICULATION[0] <= articulation <= ARTICULATION[1]:
         raise InputError(f"articulation must be between 0.5 and 1.5, got {articulation}")
@@ -84,7 +97,7 @@ def plan(model: Model, alignment: Alignment, *, articulation: float = 1.0) -> Tr
     labels = frame_labels(alignment, frames, float(model.fps))
     alpha, beta = (
         scale_about(y, neutral, articulation)
-        for y, neutral in zip(trajectories(model, labels), silent_mouth(model), strict=True)
+        for y, neutral in zip(moved_by(model, labels, movement), silent_mouth(model), strict=True)
     )
     return Trajectory(tuple(labels), alpha, focused(project_on_simplex(beta)), model.fps)
 

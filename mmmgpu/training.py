@@ -20,6 +20,7 @@ from mmmgpu.corpus_steps import (
     Thumbnails,
     analyse_corpus,
     calmest,
+    fit_dynamics,
     make_model,
     rebased_frames,
     track_corpus,
@@ -27,6 +28,7 @@ from mmmgpu.corpus_steps import (
     utterances_of,
 )
 from mmmgpu.models import Model
+from mmmgpu.phonemes import Utterance
 from mmmgpu.phones import SIL
 from mmmgpu.progress import progress_bar
 from mmmgpu.prototype_flows import prototype_basis
@@ -34,7 +36,6 @@ from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordin
 from mmmgpu.references import check_sound, find_reference, rebase_reference
 from mmmgpu.trajectory_training import TrainedStream, fit_stream
 
-Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
 
@@ -118,19 +119,19 @@ class _Training:
             frames, reference.region, chosen, reference_frame, coordinates, flow=flow
         )
         alphas, betas = analyse_corpus(self.folder, frames, basis, flow=flow, backend=self.backend)
-        alpha = self._phonemes(frames, "alpha", alphas)
-        beta = self._phonemes(frames, "beta", betas)
+        spoken = [utterances_of(frames, stream) for stream in (alphas, betas)]
         whole, sources = frames.pictures(chosen)
         return Model(
             basis=basis,
             reference=reference,
-            alpha=alpha,
-            beta=beta,
+            alpha=self._phonemes("alpha", spoken[0]),
+            beta=self._phonemes("beta", spoken[1]),
             fps=used[0].info.fps,
             prototype_frames=whole,
             sources=sources,
             calm=calmest(frames),
             notes=_notes(frames, skipped, self.options),
+            dynamics=fit_dynamics(*spoken),
         )
 
     def _choose(self, frames: Frames) -> tuple[NDArray[np.int64], int, F32]:
@@ -144,9 +145,8 @@ class _Training:
         neutral = most_neutral(coordinates[usable], chosen, silent[usable])
         return usable[chosen], int(usable[chosen[neutral]]), coordinates
 
-    def _phonemes(self, frames: Frames, name: str, coordinates: list[Floats]) -> TrainedStream:
+    def _phonemes(self, name: str, utterances: Sequence[Utterance]) -> TrainedStream:
         """The phoneme models of one stream, from the frames whose head was found."""
-        utterances = utterances_of(frames, coordinates)
         rng = np.random.default_rng(self.options.seed)
         with progress_bar(None, f"train {name}") as advance:
             return fit_stream(utterances, rng=rng, progress=lambda done, total: advance(1))

@@ -83,9 +83,8 @@ def difference_band(n_frames: int, order: int) -> Array:
     """
     band = np.zeros((n_frames, order + 1))
     stencil = np.array([(-1) ** i * comb(order, i) for i in range(order + 1)], dtype=np.float64)
-    for row in range(n_frames - order):
-        for i in range(order + 1):
-            band[row + i, : order + 1 - i] += stencil[i] * stencil[i:]
+    for i in range(order + 1):
+        band[i : max(n_frames - order, 0) + i, : order + 1 - i] += stencil[i] * stencil[i:]
     return band
 
 

@@ -52,6 +52,10 @@ def test_prototypes_are_chosen_anew_about_the_same_reference(two_persons, before
     for (name, t), picture in zip(model.sources, model.prototype_frames, strict=True):
         clip = next(c for c in two_persons.second.clips if c.name == name)
         np.testing.assert_array_equal(next(read_frames(clip, start=t, stop=t + 1)), picture)
+    said = {p for s in two_persons.second.sentences for p in s.split()} | {"SIL"}
+    for alpha, beta in model.dynamics.values():  # of the second person's clips alone
+        assert set(alpha.labels) == set(beta.labels) == said
+    assert set(model.dynamics) == {"hmm", "brand", "slds", "dpds"}
 
 
 def test_the_models_before_say_the_same_in_the_new_prototypes(before, adapted):

@@ -7,7 +7,7 @@ import sys
 import hmms
 import numpy as np
 import pytest
-from commands import run_command, trained_model
+from commands import assert_refused, run_command, trained_model
 from media import encode, still
 
 from mmmgpu import __version__, hmm_aligner
@@ -23,7 +23,7 @@ from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
 
 COMMANDS = ("demo", "align", "train", "reconstruct", "speak", "evaluate")
-COMMANDS += ("mark", "transfer", "adapt", "info")
+COMMANDS += ("mark", "transfer", "adapt", "compare", "info")
 SLOW = {"av", "cv2", "matplotlib", "numpy", "rich", "scipy", "sklearn", "warp"}
 
 
@@ -81,6 +81,7 @@ def test_starting_loads_no_slow_library():
         ("speak", "m.mmm", "--out", "a.mp4"),
         ("speak", "m.mmm", "--out", "a.mp4", "--text", "hello", "--audio", "a.wav"),
         ("speak", "m.mmm", "--out", "a.mp4", "--from-trajectory", "t", "--articulation", "1.2"),
+        ("speak", "m.mmm", "--out", "a.mp4", "--from-trajectory", "t", "--trajectory", "dpds"),
         ("reconstruct", "m.mmm", "a.mp4", "--out", "b.mkv", "--landmarks", "."),
         ("align", "a.mp4", "--transcripts", ".", "--out", "b", "--aligner", "ear"),
         ("align", "a.mp4", "--transcripts", ".", "--out", "b", "--dictionary", "d"),
@@ -223,6 +224,18 @@ def test_speak_text_and_its_trajectory_again(mmmgpu, model, tmp_path):
     pairs = zip(read_frames(tmp_path / "a.mkv"), read_frames(tmp_path / "b.mkv"), strict=True)
     # the CSV rounds to six figures, and both videos are compressed
     assert max(float(np.abs(a.astype(int) - b).mean()) for a, b in pairs) < 0.5
+
+
+def test_speak_by_another_movement(mmmgpu, model, tmp_path):
+    spoken = ("speak", model, "--text", "My joy!", "--out", tmp_path / "a.mkv")
+    ended = mmmgpu(*spoken, "--trajectory", "dpds", "--save-trajectory", tmp_path / "dpds.csv")
+    assert ended.status == 0
+    assert ended.err.count("mmmgpu: warning: ") == 1
+    assert mmmgpu(*spoken, "--save-trajectory", tmp_path / "egp02.csv").status == 0
+    assert (tmp_path / "dpds.csv").read_bytes() != (tmp_path / "egp02.csv").read_bytes()
+    (tmp_path / "a.mkv").unlink()
+    assert_refused(mmmgpu(*spoken, "--trajectory", "rnn"), "'rnn'", "egp02, brand, dpds, hmm, slds")
+    assert not (tmp_path / "a.mkv").exists()
 
 
 def test_speak_audio_with_alignment_and_a_late_sound(mmmgpu, world, model, tmp_path):

@@ -31,6 +31,11 @@ def assert_same(a, b, where=""):
         assert type(a) is type(b)
         for field in fields(a):
             assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, dict) and where == ".dynamics":
+        assert list(a) == list(b)
+        for name in a:
+            for one, other in zip(a[name], b[name], strict=True):
+                assert_same(one, other, f".{name}")
     elif isinstance(a, np.ndarray):
         assert (a.shape, a.dtype) == (b.shape, b.dtype), where
         np.testing.assert_array_equal(a, b, err_msg=where)
@@ -176,6 +181,61 @@ FACTS = {
     "calm a number": (lambda f: {"calm": 3}, ""),
     "suffix a path": (lambda f: {"calm": f["calm"] | {"suffix": "/../../x.mkv"}}, "suffix"),
 }
+
+
+def other_dynamics(**changes):
+    return lambda f: {"dynamics": f["dynamics"] | changes}
+
+
+MOVEMENTS = {
+    "of another model": (
+        lambda t: {},
+        other_dynamics(hmm=[{"model": "brand", "labels": ["AA", "M", "SIL"]}] * 2),
+        "tensor step_mean is missing",
+    ),
+    "unknown": (lambda t: {}, other_dynamics(x=[{"model": "x", "labels": ["AA"]}] * 2), "'x'"),
+    "one stream": (lambda t: {}, lambda f: {"dynamics": {"hmm": f["dynamics"]["hmm"][:1]}}, ""),
+    "no table": (lambda t: {}, lambda f: {"dynamics": 3}, ""),
+    "NaN": (
+        lambda t: {"dynamics.hmm.beta.mean": t["dynamics.hmm.beta.mean"] * np.nan},
+        lambda f: {},
+        "tensor mean holds NaN",
+    ),
+    "unstable": (
+        lambda t: {"dynamics.dpds.alpha.A": t["dynamics.dpds.alpha.A"] + 1},
+        lambda f: {},
+        "tensor A must be below 1",
+    ),
+    "of other dimensions": (
+        lambda t: {name: t[name][..., :-1] for name in t if name.startswith("dynamics.slds.alpha")},
+        lambda f: {},
+        "misstates dynamics.slds.alpha",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", MOVEMENTS)
+def test_bad_movements_are_said_on_one_line(data, tmp_path, fault):
+    tensors, facts, message = MOVEMENTS[fault]
+    path = tmp_path / "bad.mmm"
+    rewritten(path, data, tensors=tensors, facts=facts)
+    with pytest.raises(InputError, match=rf"bad\.mmm: .*{message}") as error:
+        load(path)
+    assert "\n" not in str(error.value)
+    assert str(error.value).count("bad.mmm") == 1
+
+
+def test_a_file_from_before_there_were_movements_still_loads(model, data, tmp_path):
+    path = tmp_path / "old.mmm"
+    rewritten(
+        path,
+        data,
+        tensors=lambda t: {name: None for name in t if name.startswith("dynamics")},
+        facts=lambda f: {"dynamics": None},
+    )
+    old = load(path)
+    assert old.dynamics == {}
+    assert_same(old.alpha, model.alpha)
 
 
 @pytest.mark.parametrize("fault", FACTS)

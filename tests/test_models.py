@@ -5,8 +5,9 @@ import oracles_model as oracles
 import pytest
 from worlds import make_model
 
+from mmmgpu.dynamics import trajectory
 from mmmgpu.errors import InputError
-from mmmgpu.models import project_on_simplex, trajectories
+from mmmgpu.models import labels_known, moved_by, project_on_simplex, trajectories
 from mmmgpu.phones import stand_in
 from mmmgpu.trajectories import synthesize_trajectory
 
@@ -66,6 +67,29 @@ def test_a_phone_without_model_gets_its_stand_in(model):
     wanted = trajectories(model, ["SIL", other, "SIL"])
     for a, b in zip(got, wanted, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_movement_is_that_of_the_model_named(model):
+    labels = ["SIL", "AA", "AA", "M"]
+    for got, want in zip(
+        moved_by(model, labels, "egp02"), trajectories(model, labels), strict=True
+    ):
+        np.testing.assert_array_equal(got, want)
+    for name, pair in model.dynamics.items():
+        for got, own in zip(moved_by(model, labels, name), pair, strict=True):
+            np.testing.assert_array_equal(got, trajectory(own, labels))
+        for got, own in zip(moved_by(model, ["B", "no phone"], name), pair, strict=True):
+            np.testing.assert_array_equal(got, trajectory(own, ["M", "AA"]))
+
+
+def test_a_movement_that_the_model_lacks_is_said(model):
+    old = replace(model, dynamics={})
+    assert labels_known(old, "egp02") == model.alpha.trained.labels
+    says = r"trajectory 'dpds': the model has only egp02; use one of them or train it again"
+    with pytest.raises(InputError, match=says):
+        moved_by(old, ["AA"], "dpds")
+    with pytest.raises(InputError, match="has only egp02, brand, dpds, hmm, slds"):
+        labels_known(model, "nn")
 
 
 def test_no_phone_no_frame(model):

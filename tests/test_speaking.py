@@ -8,9 +8,9 @@ from worlds import POSTURES, hold, make_model
 
 from mmmgpu.alignments import Alignment, Segment, cover
 from mmmgpu.errors import InputError
-from mmmgpu.models import project_on_simplex, trajectories
+from mmmgpu.models import moved_by, project_on_simplex, trajectories
 from mmmgpu.sounds import read_sound
-from mmmgpu.speaking import FAINT, FOCUS, at_rate, plan, render, silent_mouth, speak
+from mmmgpu.speaking import FAINT, FOCUS, at_rate, focused, plan, render, silent_mouth, speak
 from mmmgpu.trajectory_files import Trajectory
 from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import Speech
@@ -75,6 +75,16 @@ def test_beta_keeps_to_the_simplex_and_to_its_strongest_textures(basis, articula
     assert 0 < np.mean(planned.beta == 0) < 1
     assert (planned.beta.max(axis=1) >= near.max(axis=1)).all()
     np.testing.assert_allclose(planned.beta, [np.array(r) / sum(r) for r in kept], atol=1e-12)
+
+
+@pytest.mark.parametrize("movement", ["hmm", "brand", "slds", "dpds"])
+def test_other_movements_are_planned_alike(basis, movement):
+    model = replace(make_model(basis), fps=Fraction(25))
+    planned = plan(model, ALIGNMENT, movement=movement)
+    alpha, beta = moved_by(model, planned.labels, movement)
+    np.testing.assert_array_equal(planned.alpha, alpha)
+    np.testing.assert_array_equal(planned.beta, focused(project_on_simplex(beta)))
+    assert (planned.alpha != plan(model, ALIGNMENT).alpha).any()
 
 
 def test_many_equal_textures_are_all_kept(basis):

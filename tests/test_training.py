@@ -13,6 +13,7 @@ import mmmgpu.corpus_steps
 from mmmgpu import load
 from mmmgpu.analysis import analyze, prepare_analysis
 from mmmgpu.backends import get_backend
+from mmmgpu.dynamics import trajectory
 from mmmgpu.errors import InputError
 from mmmgpu.files import TEMPORARY
 from mmmgpu.models import project_on_simplex, trajectories
@@ -68,6 +69,10 @@ def test_a_person_is_learned(world, trained):
     assert model.notes["frames"] == sum(len(motion) for motion in world.motions)
     assert model.calm.data.tobytes() in {clip.read_bytes() for clip in world.clips}
     assert load(out).sources == model.sources
+    assert set(model.dynamics) == {"hmm", "brand", "slds", "dpds"}
+    for pair in model.dynamics.values():
+        assert [trajectory(one, ["SIL"]).shape for one in pair] == [(1, 5), (1, 6)]
+        assert pair[0].labels == model.alpha.trained.labels
 
 
 def test_prototypes_are_the_frames_that_are_named(world, trained):

@@ -8,6 +8,7 @@ from pairs import interrupt_second_step
 
 from mmmgpu.alignments import read_alignment
 from mmmgpu.correspondence import rbf_correspondence
+from mmmgpu.dynamics import trajectory
 from mmmgpu.errors import InputError
 from mmmgpu.files import write_json
 from mmmgpu.landmarks import lip_opening
@@ -52,6 +53,10 @@ def test_the_face_is_the_second_the_style_the_first(two_persons, moved):
     for new, old in ((model.alpha, source.alpha), (model.beta, source.beta)):
         np.testing.assert_array_equal(new.trained.mean, old.trained.mean)
         np.testing.assert_array_equal(new.trained.variance, old.trained.variance)
+    for name, pair in source.dynamics.items():
+        for new, old in zip(model.dynamics[name], pair, strict=True):
+            np.testing.assert_array_equal(trajectory(new, ["AA"]), trajectory(old, ["AA"]))
+    assert set(load(out).dynamics) == {"hmm", "brand", "slds", "dpds"}
     assert model.calm.data.tobytes() in {c.read_bytes() for c in two_persons.second.clips}
     assert load(out).notes == model.notes
 

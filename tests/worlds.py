@@ -9,7 +9,10 @@ import numpy as np
 
 from mmmgpu.alignments import Alignment, Segment, cover, write_textgrid
 from mmmgpu.basis import make_basis
+from mmmgpu.brand import Brand
+from mmmgpu.dpds import Dpds
 from mmmgpu.flows import matcher
+from mmmgpu.hmm_mean import HmmMean
 from mmmgpu.models import Calm, Model
 from mmmgpu.performer import (
     ARTICULATORS,
@@ -24,6 +27,7 @@ from mmmgpu.performer_articulation import REST
 from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.regions import region_around
 from mmmgpu.registration import Head
+from mmmgpu.slds import Slds
 from mmmgpu.tracks import Reference, Track
 from mmmgpu.trajectory_training import Constants, History, TrainedStream
 from mmmgpu.video_writing import write_video
@@ -153,6 +157,22 @@ def make_stream(rng, dims, labels=("AA", "M", "SIL")):
     return TrainedStream(pooled, trained, rng.random(dims), constants, history, rng.random(6))
 
 
+def make_dynamics(rng, dims, labels=("AA", "M", "SIL")):
+    """Models of movement of one stream that nobody has fitted, by name."""
+
+    def one(low, high, *shape):
+        return rng.uniform(low, high, shape or (len(labels) + 1, dims))
+
+    return {
+        "hmm": HmmMean(labels, one(-1, 1), one(0.1, 1)),
+        "brand": Brand(labels, one(-1, 1), one(0.1, 1), one(-1, 1), one(0.1, 1)),
+        "slds": Slds(
+            labels, one(-1, 1), one(0.1, 1), one(0, 0.9), one(-1, 1), one(0.1, 1), one(0.1, 1)
+        ),
+        "dpds": Dpds(labels, one(-1, 1), one(0, 0.9), one(-1, 1), one(0.1, 1, dims)),
+    }
+
+
 def make_model(basis, *, seed=0):
     """A whole model about `basis` of which every number is another, for files and readers."""
     rng = np.random.default_rng(seed)
@@ -164,6 +184,7 @@ def make_model(basis, *, seed=0):
         rng.integers(0, 256, (9, 11), np.uint8), rng.random((9, 11), np.float32), poses[0] * 2
     )
     points = rng.random((13, 2))
+    movers = [make_dynamics(np.random.default_rng(seed), dims) for dims in (count - 1, count)]
     reference = Reference(head, rng.random((13, 3), np.float32), points, basis.region)
     return Model(
         basis=basis,
@@ -175,4 +196,5 @@ def make_model(basis, *, seed=0):
         sources=tuple((f"clip ü {i}.mkv", 10 * i) for i in range(count)),
         calm=Calm(rng.integers(0, 256, 100, np.uint8), ".mkv", track),
         notes={"skipped": {"a.mkv": "why"}, "seed": 3, "residual": 0.1},
+        dynamics={name: (movers[0][name], movers[1][name]) for name in movers[0]},
     )

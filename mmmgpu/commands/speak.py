@@ -68,6 +68,15 @@ def speak(
             default_factory=LibraryDefault("mmmgpu.voices", "say", "voice"),
         ),
     ],
+    movement: Annotated[
+        str,
+        typer.Option(
+            "--trajectory",
+            metavar="NAME",
+            help="How phones become movement: egp02, hmm, brand, slds or dpds.",
+            default_factory=LibraryDefault("mmmgpu.speaking", "plan", "movement"),
+        ),
+    ],
     articulation: Annotated[
         float,
         typer.Option(
@@ -108,15 +117,18 @@ def speak(
     require_output(json, [out, *inputs])
     from mmmgpu.backends import get_backend
     from mmmgpu.model_files import load
+    from mmmgpu.models import REGULARISED
     from mmmgpu.speaking import plan, render
     from mmmgpu.trajectory_files import read_trajectory, write_trajectory
 
+    if from_trajectory is not None and movement != REGULARISED:
+        raise typer.BadParameter("--from-trajectory has its own", param_hint="--trajectory")
     get_backend(backend)
     person = load(model)
     sound, phones = _voice(text, voice, alignment, audio, transcript)
     if phones is not None:
-        stand_ins = _stand_ins(person, phones)
-        trajectory = plan(person, phones, articulation=articulation)
+        stand_ins = _stand_ins(person, phones, movement)
+        trajectory = plan(person, phones, movement=movement, articulation=articulation)
     elif from_trajectory is not None:
         stand_ins = {}
         trajectory = read_trajectory(from_trajectory, len(person.basis.images), person.fps)
@@ -170,11 +182,12 @@ def _given(text: str) -> str:
     return read_text(Path(text[1:])) if text.startswith("@") else text
 
 
-def _stand_ins(model: "Model", phones: "Alignment") -> dict[str, str]:
+def _stand_ins(model: "Model", phones: "Alignment", movement: str) -> dict[str, str]:
     """Phones that the model has not seen and those that take their place; one warning."""
+    from mmmgpu.models import labels_known
     from mmmgpu.phones import stand_in
 
-    known = set(model.alpha.trained.labels)
+    known = set(labels_known(model, movement))
     unknown = sorted({phone.label for phone in phones.phones} - known)
     found = {label: stand_in(label, known) for label in unknown}
     if found:

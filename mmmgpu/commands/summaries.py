@@ -41,6 +41,7 @@ def flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]
 def model_facts(model: "Model", path: Path) -> dict[str, Any]:
     """All that `model`, read from `path`, holds beside pictures: JSON values."""
     from mmmgpu.model_files import VERSION
+    from mmmgpu.models import REGULARISED
 
     region = model.reference.region
     alpha = model.alpha.trained
@@ -60,6 +61,7 @@ def model_facts(model: "Model", path: Path) -> dict[str, Any]:
             "bytes": int(model.calm.data.size),
             "frames": len(model.calm.track),
         },
+        "trajectories": [REGULARISED, *model.dynamics],
         "notes": model.notes,
     }
 
@@ -91,6 +93,7 @@ def show_model(model: "Model", path: Path) -> None:
         gain = 1 - error["trained"] / error["pooled"] if error["pooled"] else 0.0
         said = ", ".join(f"{key} {value:g}" for key, value in constants.items())
         rows.append((f"{name} training", f"{said}; error {100 * gain:.1f} % below pooled"))
+    rows.append(("trajectories", ", ".join(facts["trajectories"])))
     rows += [(key.replace("_", " "), _said(value)) for key, value in model.notes.items()]
     show_table(str(path), rows)
 

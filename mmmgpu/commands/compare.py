@@ -1,0 +1,108 @@
+"""``mmmgpu compare``: the models of movement, judged by cross-validation."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mmmgpu.commands.options import (
+    Alignments,
+    Backend,
+    Clips,
+    Json,
+    LibraryDefault,
+    RegionBox,
+    Sync,
+    parse_box,
+)
+from mmmgpu.commands.places import require_output, videos_in, write_results
+from mmmgpu.commands.summaries import show_table
+from mmmgpu.errors import InputError
+
+EXAMPLE = "Example: mmmgpu compare clips/ --alignments aligned --landmarks points --out figure4"
+
+
+def compare(
+    clips: Clips,
+    *,
+    alignments: Alignments,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the results and figures.")
+    ],
+    features: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="aam or mmm, learned anew in every fold; or a folder with NAME.npz for every clip "
+            "NAME.*, which holds the array 'features' (frames, d).",
+        ),
+    ] = "aam",
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Landmarks of the clips, for --features aam."),
+    ] = None,
+    folds: Annotated[
+        int,
+        typer.Option(
+            help="Folds that the clips are dealt into.",
+            default_factory=LibraryDefault("mmmgpu.comparison", "CompareOptions", "folds"),
+        ),
+    ],
+    videos: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Also render every clip by every model and by 'reality', its own features: "
+            "DIR/CONDITION/CLIP.mp4, as the study takes them.",
+        ),
+    ] = None,
+    sync: Sync,
+    region: RegionBox = None,
+    seed: Annotated[
+        int,
+        typer.Option(
+            help="Of the folds.",
+            default_factory=LibraryDefault("mmmgpu.comparison", "CompareOptions", "seed"),
+        ),
+    ],
+    backend: Backend,
+    json: Json = None,
+) -> None:
+    """Compare five models of movement on CLIPs with phones.
+
+    Each clip is generated from its phones by models that were fitted to the other folds' clips, and
+    compared with what was seen in it: distances, likelihood, correlation, variance and smoothness,
+    with 95 % intervals over the folds and paired tests. A killed comparison goes on where it was.
+    """
+    found = videos_in(clips)
+    box = None if region is None else parse_box(region)
+    require_output(json, found)
+    require_output(out / "compare.json", found)
+    from mmmgpu.backends import get_backend
+    from mmmgpu.comparison import CompareOptions
+    from mmmgpu.comparison import compare as judge
+    from mmmgpu.comparison_features import SavedFeatures, features_named
+    from mmmgpu.comparison_reports import pair_rows, table_rows, write_comparison
+    from mmmgpu.comparison_scores import METRICS
+    from mmmgpu.corpora import check_rates, open_corpus
+
+    get_backend(backend)
+    source = features_named(
+        features,
+        alignments=alignments,
+        landmarks=landmarks,
+        options={"sync": sync, "region": box},
+        backend=backend,
+    )
+    if videos is not None and isinstance(source, SavedFeatures):
+        raise InputError("--videos: saved features have no pictures; give --features aam or mmm")
+    corpus = open_corpus(found, alignments, sync=sync)
+    check_rates(corpus)
+    options = CompareOptions(folds=folds, seed=seed)
+    results = judge(corpus, source, out / "work", videos=videos, options=options)
+    write_comparison(results, out)
+    title = f"{len(corpus)} sentences, {folds} folds: mean and 95 % interval over folds"
+    show_table(title, table_rows(results), ["model", *METRICS])
+    header = ["metric", "models", "difference", "p (t)", "p (Wilcoxon)"]
+    show_table("paired over folds", pair_rows(results), header)
+    write_results(results, json)

@@ -1,0 +1,221 @@
+"""Comparison of the models of movement by cross-validation over sentences (ECR07, section 4).
+
+The sentences are dealt into folds. For each fold features are learned from the other folds' clips
+(`mmmgpu.comparison_features`), every model is fitted to them, and each is judged by what it
+generates for the fold's own sentences. Folds run in parallel processes; those that are finished are
+kept, so that a killed comparison goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmmgpu.backends import default_threads
+from mmmgpu.checkpoints import (
+    fingerprint,
+    finished_steps_only,
+    open_checkpoints,
+    read_step,
+    write_step,
+)
+from mmmgpu.comparison_features import Eye, Features
+from mmmgpu.comparison_scores import Scores, paired_tests, score, summarise
+from mmmgpu.corpora import Clip
+from mmmgpu.dynamics import MODELS, Dynamics, Generative, trajectory
+from mmmgpu.errors import InputError
+from mmmgpu.files import require_folder
+from mmmgpu.labelled import Floats, check_sequence, stand_ins
+from mmmgpu.processes import Tick, Work, share_out
+from mmmgpu.progress import progress_bar
+
+REALITY = "reality"  # the condition of videos made from real features
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """What a person may choose about a comparison.
+
+    folds: into which the sentences are dealt.
+    seed: of the dealing.
+    """
+
+    folds: int = 10
+    seed: int = 0
+
+
+DEFAULTS = CompareOptions()
+
+
+def compare(
+    corpus: Sequence[Clip],
+    features: Features,
+    work: Path,
+    *,
+    videos: Path | None = None,
+    options: CompareOptions = DEFAULTS,
+) -> dict[str, Any]:
+    """Judge every model of `dynamics.MODELS` on sentences that it was not fitted to.
+
+    Args:
+        corpus: Clips of one person with their alignments: the sentences.
+        features: Where features come from.
+        work: Folder for finished folds; removed at the end. The same call continues there.
+        videos: Folder for ``CONDITION/SENTENCE.mp4`` of every sentence by every model and by
+            `REALITY`. None: no videos are made.
+        options: See `CompareOptions`.
+
+    Returns:
+        JSON values: `models` and `tests` (see `comparison_scores`), `folds` with the scores of
+        each, `sentences` with those of each sentence, and `stand_ins`, the labels that were in no
+        sentence that a fold learned from, with what took their place.
+
+    Raises:
+        InputError: There are fewer clips than folds, or fewer than two folds; what cannot be used
+            is named by fold and sentence.
+    """
+    folds = deal(len(corpus), options)
+    given = {**vars(options), "features": features.facts(), "videos": str(videos)}
+    given["said"] = [clip.labels for clip in corpus]
+    folder = open_checkpoints(work, fingerprint([clip.path for clip in corpus], given))
+    shared = (folder, list(corpus), features, folds, videos)
+    done = [read_step(folder, f"fold-{f}") is not None for f in range(len(folds))]
+    with progress_bar(len(folds) * len(MODELS), "compare") as advance, finished_steps_only(folder):
+        advance(sum(done) * len(MODELS))
+        left = [f for f, is_done in enumerate(done) if not is_done]
+        share_out(_comparing, shared, left, processes=default_threads(), advance=advance)
+    results = [_read(folder, f) for f in range(len(folds))]
+    shutil.rmtree(folder)
+    return _gathered(results)
+
+
+def deal(count: int, options: CompareOptions) -> list[list[int]]:
+    """Numbers 0 ... count - 1 in `options.folds` random folds whose sizes differ by 1 at most.
+
+    Raises:
+        InputError: There are not that many folds to be had.
+    """
+    if not 2 <= options.folds <= count:
+        raise InputError(
+            f"folds must be between 2 and the number of clips, {count}, got {options.folds}"
+        )
+    order = np.random.default_rng(options.seed).permutation(count)
+    return [sorted(order[f :: options.folds].tolist()) for f in range(options.folds)]
+
+
+def _comparing(shared: tuple[Path, list[Clip], Features, list[list[int]], Path | None]) -> Work:
+    """Keeps the results of a fold."""
+    folder, corpus, features, folds, videos = shared
+
+    def work(fold: int, tick: Tick) -> None:
+        result = _Fold(fold, corpus, features, folds[fold], videos).run(folder, tick)
+        write_step(folder, f"fold-{fold}", {"result": np.array(json.dumps(result))})
+
+    return work
+
+
+@dataclass(frozen=True)
+class _Fold:
+    """One fold: the sentences `own` are judged by what is learned from all others."""
+
+    number: int
+    corpus: Sequence[Clip]
+    features: Features
+    own: Sequence[int]
+    videos: Path | None
+
+    def run(self, folder: Path, tick: Tick) -> dict[str, Any]:
+        others = [i for i in range(len(self.corpus)) if i not in self.own]
+        with self._named("features"):
+            eye = self.features.learn([self.corpus[i] for i in others], folder, self.number)
+        y: dict[int, Floats] = {}
+        for i in (*others, *self.own):
+            y[i] = self._seen(eye, i, y[others[0]].shape[1] if y else None)
+        labels = [self.corpus[i].labels for i in others]
+        scores: dict[str, Scores] = {}
+        sentences: dict[str, dict[str, Scores]] = {self._name(i): {} for i in self.own}
+        for name, kind in MODELS.items():
+            with self._named(name):
+                model = kind.fit([y[i] for i in others], labels)
+            made, likely = [], []
+            for i in self.own:
+                x, value = self._judged(name, model, i, y[i])
+                made.append(x)
+                likely.append(value)
+                sentences[self._name(i)][name] = score([x], [y[i]], value)
+                self._show(eye, name, i, x)
+            total = None if None in likely else float(sum(v for v in likely if v is not None))
+            scores[name] = score(made, [y[i] for i in self.own], total)
+            tick()
+        for i in self.own:
+            self._show(eye, REALITY, i, y[i])
+        spoken = [label for i in self.own for label in self.corpus[i].labels]
+        known = sorted({label for row in labels for label in row})
+        return {"scores": scores, "sentences": sentences, "stand_ins": stand_ins(known, spoken)}
+
+    def _name(self, i: int) -> str:
+        return self.corpus[i].path.stem
+
+    def _seen(self, eye: Eye, i: int, d: int | None) -> Floats:
+        """Features of sentence i, (T, d); any d if None."""
+        with self._named(self._name(i)):
+            clip = self.corpus[i]
+            return check_sequence(eye.features(clip), clip.labels, "features", d)
+
+    def _judged(self, name: str, model: Dynamics, i: int, y: Floats) -> tuple[Floats, float | None]:
+        """What `model` makes of sentence i, and how likely it holds the real one."""
+        labels = self.corpus[i].labels
+        with self._named(f"{self._name(i)} by {name}"):
+            value = model.log_likelihood(y, labels) if isinstance(model, Generative) else None
+            return trajectory(model, labels), value
+
+    def _show(self, eye: Eye, condition: str, i: int, x: Floats) -> None:
+        if self.videos is not None:
+            out = require_folder(self.videos / condition) / f"{self._name(i)}.mp4"
+            with self._named(f"{self._name(i)} by {condition}"):
+                eye.render(self.corpus[i], x, out)
+
+    @contextmanager
+    def _named(self, what: str) -> Iterator[None]:
+        """Errors say which fold and sentence or model they are of."""
+        try:
+            yield
+        except (InputError, ArithmeticError, np.linalg.LinAlgError) as e:
+            raise InputError(f"fold {self.number + 1}, {what}: {e}") from e
+
+
+def _read(folder: Path, fold: int) -> dict[str, Any]:
+    step = read_step(folder, f"fold-{fold}")
+    assert step is not None, fold
+    result: dict[str, Any] = json.loads(str(step["result"]))
+    return result
+
+
+def _gathered(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """All folds together; one warning tells of the labels that some fold had to replace."""
+    missing: dict[str, dict[str, str]] = {}
+    for number, result in enumerate(results, start=1):
+        if result["stand_ins"]:
+            missing[f"fold {number}"] = result["stand_ins"]
+    if missing:
+        said = "; ".join(
+            f"{fold}: " + ", ".join(f"{other} for {label}" for label, other in own.items())
+            for fold, own in missing.items()
+        )
+        print(f"warning: not in every fold's training sentences: {said}", file=sys.stderr)
+    scores = [result["scores"] for result in results]
+    return {
+        "models": summarise(scores),
+        "tests": paired_tests(scores),
+        "folds": scores,
+        "sentences": {k: v for r in results for k, v in sorted(r["sentences"].items())},
+        "stand_ins": missing,
+    }

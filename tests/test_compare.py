@@ -1,0 +1,55 @@
+"""The command ``mmmgpu compare``, with features that were saved."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import assert_refused, run_command
+
+from mmmgpu.corpora import open_corpus
+from mmmgpu.dynamics import MODELS
+
+
+@pytest.fixture
+def mmmgpu(capfd):
+    return lambda *args: run_command(capfd, *args)
+
+
+@pytest.fixture(scope="module")
+def saved(world, tmp_path_factory):
+    """A folder with features of the clips: two numbers that follow the phones."""
+    folder = tmp_path_factory.mktemp("features ü")
+    for i, clip in enumerate(open_corpus(world.clips, world.alignments)):
+        rng = np.random.default_rng(i)
+        level = [[len(label), ord(label[0]) / 20] for label in clip.labels]
+        y = np.array(level) + 0.3 * rng.normal(size=(len(level), 2))
+        np.savez(folder / f"{clip.path.stem}.npz", features=y)
+    return folder
+
+
+def asked(world, saved, out, *more):
+    given = ("--alignments", world.alignments, "--features", saved, "--out", out)
+    return ("compare", *world.clips, *given, "--folds", "2", *more)
+
+
+def test_compare(mmmgpu, world, saved, tmp_path):
+    out = tmp_path / "new" / "figure 4"
+    ended = mmmgpu(*asked(world, saved, out, "--json", tmp_path / "results.json"))
+    assert ended.status == 0
+    names = ["compare.csv", "compare.json", "figure4.png", "figure4.svg"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results == json.loads((out / "compare.json").read_text())
+    assert list(results["models"]) == list(MODELS)
+    assert "4 sentences, 2 folds" in ended.out
+    assert "hmm - brand" in ended.out
+    assert ended.err.count("warning: ") == bool(results["stand_ins"])
+
+
+def test_what_cannot_be_compared_is_refused(mmmgpu, world, saved, tmp_path):
+    videos = ("--videos", tmp_path / "videos")
+    assert_refused(mmmgpu(*asked(world, saved, tmp_path / "a", *videos)), "--videos", "pictures")
+    assert_refused(mmmgpu(*asked(world, "aam", tmp_path / "a")), "--landmarks")
+    assert_refused(mmmgpu(*asked(world, tmp_path / "none", tmp_path / "a")), "none")
+    assert_refused(mmmgpu(*asked(world, saved, tmp_path / "a", "--folds", "5")), "4", "5")
+    assert list(tmp_path.rglob("*.*")) == []

@@ -1,0 +1,214 @@
+import json
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from oracles_dynamics import drawn_labels
+
+from mmmgpu import comparison
+from mmmgpu.alignments import Alignment, Segment
+from mmmgpu.comparison import REALITY, CompareOptions, _Fold, compare, deal
+from mmmgpu.comparison_features import SavedFeatures
+from mmmgpu.comparison_scores import METRICS, score
+from mmmgpu.corpora import Clip
+from mmmgpu.dpds import Dpds
+from mmmgpu.dynamics import MODELS, trajectory
+from mmmgpu.errors import InputError
+from mmmgpu.hmm_mean import HmmMean
+from mmmgpu.videos import VideoInfo
+
+FPS = 25
+
+
+def sentence(folder, name, labels, y):
+    """A clip that is no video, with its phones and saved features."""
+    path = folder / f"{name}.mkv"
+    path.write_bytes(name.encode())
+    np.savez(folder / f"{name}.npz", features=y)
+    segments = [Segment(label, t / FPS, (t + 1) / FPS) for t, label in enumerate(labels)]
+    length = len(labels) / FPS
+    info = VideoInfo(path, 16, 16, Fraction(FPS), len(labels), length, False)
+    return Clip(path, info, Alignment(tuple(segments), (), length))
+
+
+def corpus(folder, number=6):
+    rng = np.random.default_rng(0)
+    labels = drawn_labels(rng, number, labels=["AA", "M", "S"], length=(8, 12), first="SIL")
+    walks = [rng.normal(size=(len(own), 2)).cumsum(axis=0) for own in labels]
+    return [
+        sentence(folder, f"s{i}", *pair) for i, pair in enumerate(zip(labels, walks, strict=True))
+    ]
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare")
+    clips = corpus(folder)
+    options = CompareOptions(folds=2)
+    return folder, clips, compare(clips, SavedFeatures(folder), folder / "work", options=options)
+
+
+def test_every_sentence_is_in_one_fold():
+    folds = deal(23, CompareOptions(folds=5, seed=1))
+    assert sorted(i for fold in folds for i in fold) == list(range(23))
+    assert {len(fold) for fold in folds} == {4, 5}
+    assert folds != deal(23, CompareOptions(folds=5, seed=2))
+
+
+@pytest.mark.parametrize("folds", [1, 0, 4])
+def test_a_wrong_number_of_folds_is_refused(folds):
+    with pytest.raises(InputError, match="folds must be between 2 and the number of clips, 3"):
+        deal(3, CompareOptions(folds=folds))
+
+
+def test_every_model_has_every_number_that_it_can_have(compared):
+    _, clips, results = compared
+    assert list(results["models"]) == list(MODELS)
+    for name, found in results["models"].items():
+        assert tuple(found) == METRICS
+        assert (found["log_likelihood"] is None) == (not MODELS[name].comparable)
+        assert found["rms"]["folds"] == 2
+        assert found["rms"]["mean"] > 0
+    assert sorted(results["sentences"]) == [clip.path.stem for clip in clips]
+    json.dumps(results, allow_nan=False)
+
+
+def test_each_fold_is_judged_by_models_of_the_others(compared):
+    folder, clips, results = compared
+    own = deal(len(clips), CompareOptions(folds=2))[1]
+    y = [np.load(folder / f"s{i}.npz")["features"] for i in range(len(clips))]
+    others = [i for i in range(len(clips)) if i not in own]
+    model = Dpds.fit([y[i] for i in others], [clips[i].labels for i in others])
+    made = [trajectory(model, clips[i].labels) for i in own]
+    likely = [model.log_likelihood(y[i], clips[i].labels) for i in own]
+    want = score(made, [y[i] for i in own], sum(likely))
+    assert results["folds"][1]["dpds"] == pytest.approx(want, rel=1e-9)
+    first = results["sentences"][f"s{own[0]}"]["dpds"]
+    assert first == pytest.approx(score(made[:1], [y[own[0]]], likely[0]), rel=1e-9)
+
+
+def test_nothing_is_left_of_the_work(compared):
+    assert not (compared[0] / "work").exists()
+
+
+def few_models(monkeypatch):
+    monkeypatch.setattr(comparison, "MODELS", {"hmm": HmmMean, "dpds": Dpds})
+
+
+def run_here(monkeypatch):
+    """Folds are done in this process, with two models; returns the numbers of those done."""
+    done = []
+
+    def share_out(prepare, shared, items, *, processes, advance):
+        for item in items:
+            prepare(shared)(item, lambda: advance(1))
+            done.append(item)
+
+    monkeypatch.setattr(comparison, "share_out", share_out)
+    few_models(monkeypatch)
+    return done
+
+
+def test_a_killed_comparison_goes_on_and_ends_in_the_same(tmp_path, monkeypatch):
+    clips, done = corpus(tmp_path), run_here(monkeypatch)
+    options, saved = CompareOptions(folds=3), SavedFeatures(tmp_path)
+    whole = compare(clips, saved, tmp_path / "work", options=options)
+    assert done == [0, 1, 2]
+    done.clear()
+    keep = comparison.write_step
+
+    def killed(folder, name, arrays):
+        if name == "fold-1":
+            raise KeyboardInterrupt
+        keep(folder, name, arrays)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(comparison, "write_step", killed)
+        with pytest.raises(KeyboardInterrupt):
+            compare(clips, saved, tmp_path / "work", options=options)
+    assert done == [0]
+    done.clear()
+    assert compare(clips, saved, tmp_path / "work", options=options) == whole
+    assert done == [1, 2]
+    np.savez(tmp_path / "s0.npz", features=np.load(tmp_path / "s0.npz")["features"] + 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(comparison, "write_step", killed)
+        with pytest.raises(KeyboardInterrupt):
+            compare(clips, saved, tmp_path / "work", options=options)
+    assert done == [1, 2, 0]  # other features: from the beginning
+
+
+def test_a_fold_without_some_phone_is_said(tmp_path, monkeypatch, capsys):
+    run_here(monkeypatch)
+    clips = corpus(tmp_path)
+    clips[2] = sentence(tmp_path, "s2", ["SIL", "B", "AA"], np.ones((3, 2)))
+    options = CompareOptions(folds=3)
+    results = compare(clips, SavedFeatures(tmp_path), tmp_path / "work", options=options)
+    fold = next(f for f, own in enumerate(deal(6, options), start=1) if 2 in own)
+    assert results["stand_ins"] == {f"fold {fold}": {"B": "M"}}
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"warning: not in every fold's training sentences: fold {fold}: M for B"
+
+
+FAULTS = {
+    "shorter": (np.ones((2, 2)), r"s3: features: has 2 frames but \d+ labels"),
+    "NaN": (np.full((9, 2), np.nan), "s3: features: "),
+    "no file": (None, r"s3: .*s3\.npz: no features of"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fold_that_fails_says_which_sentence(tmp_path, monkeypatch, fault):
+    if fault != "NaN":  # that one goes through processes
+        run_here(monkeypatch)
+    clips, (y, message) = corpus(tmp_path), FAULTS[fault]
+    (tmp_path / "s3.npz").unlink()
+    if y is not None:
+        clips[3] = sentence(tmp_path, "s3", clips[3].labels, y)
+    with pytest.raises(InputError, match=rf"^fold \d, {message}") as error:
+        compare(clips, SavedFeatures(tmp_path), tmp_path / "work", options=CompareOptions(folds=2))
+    assert "\n" not in str(error.value)
+
+
+def test_features_of_another_length_a_frame_name_model_and_fold(tmp_path, monkeypatch):
+    few_models(monkeypatch)
+    clips = corpus(tmp_path)
+    clips[3] = sentence(tmp_path, "s3", clips[3].labels, np.ones((len(clips[3].labels), 5)))
+    with pytest.raises(InputError, match=r"^fold 1, s3: features: .* shape \(T, 2\).* \(\d+, 5\)"):
+        _Fold(0, clips, SavedFeatures(tmp_path), [0], None).run(tmp_path, lambda: None)
+
+
+@dataclass(frozen=True)
+class Shown(SavedFeatures):
+    """Writes what it is to show."""
+
+    def learn(self, clips, folder, fold):
+        return self
+
+    def render(self, clip, features, out):
+        np.save(out, features)
+        Path(f"{out}.npy").rename(out)
+
+
+def test_videos_lie_by_condition_and_sentence(tmp_path, monkeypatch):
+    few_models(monkeypatch)
+    clips = corpus(tmp_path)
+    fold = _Fold(0, clips, Shown(tmp_path), [1, 4], tmp_path / "videos")
+    fold.run(tmp_path, lambda: None)
+    found = {p.relative_to(tmp_path / "videos").as_posix() for p in tmp_path.glob("videos/*/*")}
+    assert found == {f"{c}/s{i}.mp4" for c in ("hmm", "dpds", REALITY) for i in (1, 4)}
+    real = np.load(tmp_path / "videos" / REALITY / "s4.mp4")
+    np.testing.assert_array_equal(real, np.load(tmp_path / "s4.npz")["features"])
+
+
+def test_arithmetic_that_fails_is_said_too(tmp_path, monkeypatch):
+    class Broken(HmmMean):
+        def generate(self, labels):
+            raise FloatingPointError("overflow")
+
+    monkeypatch.setattr(comparison, "MODELS", {"hmm": Broken})
+    fold = _Fold(2, corpus(tmp_path), SavedFeatures(tmp_path), [0], None)
+    with pytest.raises(InputError, match=r"^fold 3, s0 by hmm: overflow$"):
+        fold.run(tmp_path, lambda: None)
