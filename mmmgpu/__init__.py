@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         evaluate_rbf,
         fill_holes,
         forward_warp,
+        piecewise_warp,
         sample,
     )
     from mmmgpu.reconstruction import reconstruct
@@ -52,6 +53,7 @@ __all__ = [
     "get_backend",
     "load",
     "performer",
+    "piecewise_warp",
     "rbf_correspondence",
     "read_alignment",
     "reconstruct",
@@ -78,6 +80,7 @@ _HOMES = {
         "evaluate_rbf",
         "fill_holes",
         "forward_warp",
+        "piecewise_warp",
         "sample",
     ],
     "performer": [],  # the module itself

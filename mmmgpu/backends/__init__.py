@@ -11,7 +11,7 @@ import importlib
 import os
 from typing import Any, Protocol, cast
 
-from mmmgpu.arrays import F32
+from mmmgpu.arrays import F32, I32
 from mmmgpu.errors import InputError
 
 BACKENDS = {
@@ -30,7 +30,7 @@ class Backend(Protocol):
     The shapes are those of `mmmgpu.operations` with exactly one batch axis.
     """
 
-    def to_device(self, array: F32, /) -> Any:
+    def to_device(self, array: F32 | I32, /) -> Any:
         """A device array of the same shape. It may share memory with `array`."""
 
     def to_host(self, array: Any, /) -> F32:
@@ -55,6 +55,11 @@ class Backend(Protocol):
         self, points: Any, centres: Any, weights: Any, affine: Any, sharpness: float, /
     ) -> Any:
         """(P, 2), (N, 2), (N, 2), (2, 3) -> (P, 2)."""
+
+    def piecewise_warp(
+        self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any, /
+    ) -> Any:
+        """(B, H, W, C), (B, N, 2), (K, 3), (P,), (P, 3) -> (B, P, C); whole numbers are int32."""
 
 
 def list_devices(family: str) -> dict[str, str]:

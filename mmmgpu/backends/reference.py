@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.arrays import F32, check_some_valid
+from mmmgpu.arrays import F32, I32, check_some_valid
 from mmmgpu.errors import InputError
 
 FAR = 1e8  # [px] beyond any picture, inside int32
@@ -71,6 +71,15 @@ class Reference:
             phi = np.exp(-np.float64(np.float32(sharpness)) * ((p - centre) ** 2).sum(axis=-1))
             mapped += phi[:, None] * weight
         return mapped.astype(np.float32)
+
+    def piecewise_warp(
+        self, field: F32, vertices: F32, triangles: I32, index: I32, barycentric: F32
+    ) -> F32:
+        corners = vertices[:, triangles[index]].astype(np.float64)  # (sets, P, 3, 2)
+        points = (barycentric[..., None] * corners).sum(axis=-2)
+        batch = max(len(field), len(points))
+        gathered = [_gather(field[b % len(field)], points[b % len(points)]) for b in range(batch)]
+        return np.stack(gathered)
 
 
 def _splat(field: F32, flow: F32) -> tuple[F32, F32]:
@@ -135,7 +144,7 @@ def _double(level: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.fl
     return level
 
 
-def _gather(field: F32, points: F32) -> F32:
+def _gather(field: F32, points: NDArray[np.floating]) -> F32:
     """Bilinear samples (..., C) of one field (H, W, C) at points (..., 2)."""
     height, width, _ = field.shape
     limit = np.array([width - 1, height - 1], np.float32)
