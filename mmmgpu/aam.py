@@ -1,4 +1,4 @@
-"""Active appearance models (ECR07, section 2): features of a face in video, and video from features.
+"""Active appearance models (ECR07, section 2): features of a face, and faces from features.
 
     model = fit_aam(clips, landmarks)
     c = features(model, clip, landmarks)          # (T, 32)
@@ -6,20 +6,45 @@
         ...
 
 This module is the door; the work is in `mmmgpu.aam_training`, `mmmgpu.appearances`,
-`mmmgpu.aam_fitting` and `mmmgpu.aam_rendering`.
+`mmmgpu.aam_fitting`, `mmmgpu.aam_rendering` and `mmmgpu.aam_files`.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mmmgpu.aam_files import load_aam, save_aam
+from mmmgpu.aam_fitting import Fitter, Match, match, prepare_fitting
+from mmmgpu.aam_rendering import render_face
 from mmmgpu.aam_training import fit_aam
-from mmmgpu.appearances import Aam, Floats, Seen, see
-from mmmgpu.backends import get_backend
+from mmmgpu.appearances import Aam, Seen, see
+from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.errors import InputError
 from mmmgpu.labelled_clips import LabelledClip, read_labelled_clip
-from mmmgpu.parallel import one_thread_each
+from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.videos import read_frames
 
-__all__ = ["Aam", "Seen", "features", "fit_aam", "see_clip"]
+__all__ = [
+    "Aam",
+    "Fitter",
+    "Match",
+    "Seen",
+    "complete_clip",
+    "features",
+    "fit_aam",
+    "load_aam",
+    "match",
+    "prepare_fitting",
+    "reconstruct",
+    "save_aam",
+    "see_clip",
+    "track",
+]
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 
 
 def features(aam: Aam, clip: Path, landmarks: Path, *, backend: str = "warp") -> Floats:
@@ -48,13 +73,61 @@ def see_clip(aam: Aam, clip: Path, landmarks: Path, *, backend: str = "warp") ->
         return see(aam, frames, labelled.points, kernels, where=str(labelled.path))
 
 
+def reconstruct(
+    aam: Aam, features: Floats, clip: Path, landmarks: Path, *, backend: str = "warp"
+) -> Iterator[Picture]:
+    """The frames of `clip` with faces made from `features` (T, n) in place of their own.
+
+    Each face stands under the pose and in the light of the frame's own, which its landmarks and
+    colours say. With the clip's own features it is what the model can show of the clip.
+
+    Raises:
+        InputError: The clip or its landmarks cannot be used, or `features` are not those of so
+            many frames.
+    """
+    labelled = complete_clip(aam, clip, landmarks)
+    c = np.asarray(features, np.float64)
+    wanted = (labelled.info.frames, len(aam.variance))
+    if c.shape != wanted or not np.isfinite(c).all():
+        raise InputError(
+            f"features for {labelled.path} must be finite, of shape {wanted}, got {c.shape}"
+        )
+    kernels = get_backend(backend, 1)
+
+    def one(item: tuple[int, Picture], _: Cancelled) -> Picture:
+        t, frame = item
+        where = f"{labelled.path}, frame {t}"
+        return render_face(aam, frame, labelled.points[t], c[t], kernels, where=where)
+
+    yield from map_ordered(one, enumerate(read_frames(labelled.path)), threads=default_threads())
+
+
+def track(aam: Aam, clip: Path, start: Floats, *, backend: str = "warp") -> Iterator[Match]:
+    """The model fitted to one frame of `clip` after the other, each from the one before.
+
+    start: points of the first frame, (N, 2) [px], some pixels off at most.
+
+    Raises:
+        InputError: The clip cannot be read, or `start` is not so many points.
+    """
+    fitter, kernels, points = prepare_fitting(aam), get_backend(backend, 1), start
+    for frame in read_frames(clip):
+        found = match(fitter, frame, points, kernels)
+        points = found.shape
+        yield found
+
+
 def complete_clip(aam: Aam, clip: Path, landmarks: Path) -> LabelledClip:
-    """`clip` with the landmarks that the model uses, in every frame."""
+    """`clip` with the landmarks that the model uses, in every frame.
+
+    Raises:
+        InputError: Some frames have none, or there are more or fewer than the model has points.
+    """
     labelled = read_labelled_clip(Path(clip), Path(landmarks), aam.rows)
     if not labelled.is_complete:
         raise InputError(
             f"{labelled.path}: only {len(labelled.frames)} of {labelled.info.frames} frames have "
-            "landmarks; fit the model to the others, or label them"
+            "landmarks; label the others too"
         )
     number = len(aam.mesh.vertices)
     if labelled.points.shape[1] != number:

@@ -35,7 +35,7 @@ Numbers = NDArray[np.int64]
 
 LARGEST = 20_000  # pixels of the mean shape; larger frames are reduced
 SHAPE_SHARE = 0.99  # of the variance of shapes that fitting follows; the rest is jitter
-MOST_TEXTURES = 64  # texture modes that fitting ignores at most
+TEXTURES = 8  # modes that fitting looks through; with many of them even a jaw can be explained
 FOLDED = 0.1  # of a shape's size: a triangle that is turned over by more is an error
 LIGHT_ITERATIONS = 4  # of the mean texture and the lights of the frames
 
@@ -82,7 +82,7 @@ def fit_aam(
         shape, texture = principal_components(shape_gram), principal_components(texture_gram)
         both = principal_components(weight**2 * shape_gram + texture_gram)
         n = _count(both, parameters, variance)
-        k, m = shape.count_for(SHAPE_SHARE), min(MOST_TEXTURES, len(texture.variance))
+        k, m = shape.count_for(SHAPE_SHARE), min(TEXTURES, len(texture.variance))
         return Aam(
             mesh=mesh,
             rows=rows,

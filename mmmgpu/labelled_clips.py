@@ -1,4 +1,4 @@
-"""Clips in which landmarks are known, in every frame or in some: what an appearance model is made of.
+"""Clips in which landmarks are known, in all frames or some: what an appearance model is made of.
 
 Landmarks lie beside each clip or in a folder of their own: ``NAME.npz`` of a face tracker (see
 `mmmgpu.landmarks`), or ``NAME.json`` with points that a person has set in some frames

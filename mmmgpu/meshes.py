@@ -74,7 +74,8 @@ def doubled_areas(points: Floats, triangles: Ints) -> Floats:
     """Twice the signed area of each triangle [px^2], points (..., N, 2) -> (..., K)."""
     a, b, c = (points[..., triangles[:, i], :] for i in range(3))
     first, second = b - a, c - a
-    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+    doubled: Floats = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    return doubled
 
 
 def fold_depths(points: Floats, triangles: Ints) -> Floats:
@@ -85,7 +86,7 @@ def fold_depths(points: Floats, triangles: Ints) -> Floats:
     corners = points[..., triangles, :]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=-2), axis=-1).max(axis=-1)
     height = doubled_areas(points, triangles) / np.maximum(sides, 1e-12)
-    return np.maximum(-height, 0.0)
+    return np.asarray(np.maximum(-height, 0.0))
 
 
 def rasterize(vertices: Floats, triangles: Ints, shape: tuple[int, int]) -> Pixels:

@@ -2,12 +2,12 @@
 
     x = T(s),   T(p) = [a -b; b a] p + (t_x, t_y)
 
-A shape is (N, 2), (x, y) [px]; a pose is the row (a, b, t_x, t_y) of the similarity T that carries a
-shape s of the common frame to the points x of a picture. How shapes vary is found by
+A shape is (N, 2), (x, y) [px]; a pose is the row (a, b, t_x, t_y) of the similarity T that carries
+a shape s of the common frame to the points x of a picture. How shapes vary is found by
 `mmmgpu.components`.
 
 Sources: Goodall, "Procrustes methods in the statistical analysis of shape" (J. Royal Stat. Soc. B
-53, 1991); Cootes & Taylor, "Statistical models of appearance for computer vision" (2004), chapter 4.
+53, 1991); Cootes & Taylor, "Statistical models of appearance for computer vision" (2004).
 """
 
 import numpy as np
@@ -35,7 +35,8 @@ def fit_pose(source: Floats, target: Floats) -> Floats:
 
 def place(pose: Floats, points: Floats) -> Floats:
     """T(points): poses (..., 4), points (..., N, 2) -> (..., N, 2)."""
-    return _turn(pose[..., 0], pose[..., 1], points) + pose[..., None, 2:]
+    placed: Floats = _turn(pose[..., 0], pose[..., 1], points) + pose[..., None, 2:]
+    return placed
 
 
 def inverse_pose(pose: Floats) -> Floats:
@@ -87,4 +88,4 @@ def procrustes_mean(shapes: Floats) -> Floats:
         mean = new
         if settled:
             break
-    return mean
+    return np.asarray(mean)
