@@ -111,7 +111,8 @@ def prepare_fitting(aam: Aam) -> Fitter:
     levels = tuple(_level(aam, directions, factor) for factor in FACTORS)
     meets = (mesh.triangles[None] == np.arange(len(mesh.vertices))[:, None, None]).any(axis=2)
     shares = np.asarray(meets / meets.sum(axis=1, keepdims=True), np.float64)
-    return Fitter(aam, levels, directions, np.linalg.inv(_sides(mesh, mesh.vertices)), shares)
+    inverse_sides = np.asarray(np.linalg.inv(_sides(mesh, mesh.vertices)), np.float64)
+    return Fitter(aam, levels, directions, inverse_sides, shares)
 
 
 def match(fitter: Fitter, frame: NDArray[np.uint8], start: Floats, kernels: Backend) -> Match:
