@@ -2,6 +2,7 @@ import signal
 
 import hypothesis
 import pytest
+from drawn_aams import make_drawn_aam
 from pairs import make_two_persons
 from worlds import make_postures, make_world
 
@@ -46,6 +47,12 @@ def world(tmp_path_factory):
 def two_persons(world, tmp_path_factory):
     """The person of `world` with a model, and another one with two clips; see `pairs`."""
     return make_two_persons(world, tmp_path_factory.mktemp("second"))
+
+
+@pytest.fixture(scope="session")
+def drawn(world):
+    """The person of `world` with landmarks and an appearance model; see `drawn_aams`."""
+    return make_drawn_aam(world)
 
 
 @pytest.fixture(scope="session")
