@@ -42,8 +42,10 @@ F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 FACTORS = (4, 2, 1)  # by which the picture is reduced, one level after the other
+LEAST_PIXELS = 400  # of a level; fewer do not tell shape from texture
 STEPS = 30  # of a level at most
 SETTLED = 0.02  # [px] that no point moves further when a level is done
+ASTRAY = 1.2  # growth of what the texture misses by at which a level has gone astray
 FARTHEST = 3.0  # standard deviations of a shape mode
 POSES = 4  # parameters of the similarity
 PRIOR = 1e-2  # r: as if every colour of the texture, in [0, 1], were off by 0.1
@@ -108,11 +110,12 @@ def prepare_fitting(aam: Aam) -> Fitter:
     """Compute what is constant in fitting `aam`."""
     mesh = aam.mesh
     directions = np.concatenate([_similarities(mesh.vertices), aam.shape_modes])
-    levels = tuple(_level(aam, directions, factor) for factor in FACTORS)
+    levels = (_level(aam, directions, factor) for factor in FACTORS)
+    large = tuple(at for at in levels if at.factor == 1 or len(at.mean) >= LEAST_PIXELS)
     meets = (mesh.triangles[None] == np.arange(len(mesh.vertices))[:, None, None]).any(axis=2)
     shares = np.asarray(meets / meets.sum(axis=1, keepdims=True), np.float64)
     inverse_sides = np.asarray(np.linalg.inv(_sides(mesh, mesh.vertices)), np.float64)
-    return Fitter(aam, levels, directions, inverse_sides, shares)
+    return Fitter(aam, large, directions, inverse_sides, shares)
 
 
 def match(fitter: Fitter, frame: NDArray[np.uint8], start: Floats, kernels: Backend) -> Match:
@@ -145,18 +148,28 @@ def match(fitter: Fitter, frame: NDArray[np.uint8], start: Floats, kernels: Back
 def _descend(
     fitter: Fitter, level: Level, picture: F32, points: Floats, kernels: Backend
 ) -> tuple[Floats, bool]:
-    """Points (N, 2) after the steps of one level, and whether they had come to rest."""
+    """Points (N, 2) after the steps of one level, and whether they had come to rest.
+
+    Where the picture ends up explained much worse than at the start, the start is kept.
+    """
+    start, first = points, _missed(level, picture, points, kernels)
+    missed = first
     for _ in range(STEPS):
-        texture = read_texture(level.mesh, picture, reduce_points(points, level.factor), kernels)
-        light = _visible(fit_light(texture, level.mean))
-        missed = (take_light_off(texture, light) - level.mean).ravel()
         change = level.step @ missed + level.pull[:, POSES:] @ _shape_of(fitter.aam, points)
         new = compose(fitter, points, change)
-        moved = np.abs(new - points).max()
-        points = new
-        if moved < SETTLED:
-            return points, True
-    return points, False
+        settled = bool(np.abs(new - points).max() < SETTLED)
+        points, missed = new, _missed(level, picture, new, kernels)
+        if settled:
+            break
+    astray = np.linalg.norm(missed) > ASTRAY * np.linalg.norm(first)
+    return (start, False) if astray else (points, settled)
+
+
+def _missed(level: Level, picture: F32, points: Floats, kernels: Backend) -> F32:
+    """What the texture at `points` (N, 2), in the light of the mean, differs by from it, (3 P,)."""
+    texture = read_texture(level.mesh, picture, reduce_points(points, level.factor), kernels)
+    light = _visible(fit_light(texture, level.mean))
+    return (take_light_off(texture, light) - level.mean).ravel()
 
 
 def _visible(light: Floats) -> Floats:

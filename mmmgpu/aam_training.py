@@ -37,6 +37,7 @@ LARGEST = 20_000  # pixels of the mean shape; larger frames are reduced
 SHAPE_SHARE = 0.99  # of the variance of shapes that fitting follows; the rest is jitter
 TEXTURES = 8  # modes that fitting looks through; with many of them even a jaw can be explained
 FOLDED = 0.1  # of a shape's size: a triangle that is turned over by more is an error
+STILL = 1e-6  # [px] landmarks that move less do not move
 LIGHT_ITERATIONS = 4  # of the mean texture and the lights of the frames
 
 
@@ -73,6 +74,8 @@ def fit_aam(
         mesh, reduction = _mean_mesh(points)
         _check_folds(labelled, mesh, reduction)
         shapes, _ = align(reduce_points(points, reduction), mesh.vertices)
+        if np.ptp(shapes, axis=0).max() < STILL:
+            raise InputError("the landmarks never move; give frames that differ")
         textures = _read_textures(labelled, sample, mesh, reduction, backend)
         mean = _in_one_light(textures, _names(labelled, sample))
         textures -= mean
@@ -219,11 +222,8 @@ def _in_one_light(textures: F32, names: Sequence[str]) -> F32:
 
 
 def _weight(shape_gram: Floats, texture_gram: Floats) -> float:
-    """W: shapes and textures vary equally much (Cootes & Taylor 2004, section 5.3.1)."""
-    shape, texture = float(np.trace(shape_gram)), float(np.trace(texture_gram))
-    if not (shape > 0 and texture > 0):
-        raise InputError("all labelled frames show the same; give frames that differ")
-    return float(np.sqrt(texture / shape))
+    """W: shapes and textures vary equally much (Cootes & Taylor 2004)."""
+    return float(np.sqrt(np.trace(texture_gram) / np.trace(shape_gram)))
 
 
 def _count(both: Components, parameters: int, variance: float | None) -> int:

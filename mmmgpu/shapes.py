@@ -60,14 +60,17 @@ def _turn(a: Floats, b: Floats, points: Floats) -> Floats:
 
 
 def align(shapes: Floats, mean: Floats) -> tuple[Floats, Floats]:
-    """`shapes` (T, N, 2) brought as near to `mean` (N, 2) as similarities can.
+    """`shapes` (T, N, 2) in the frame of `mean` (N, 2), by the poses that carry it nearest to them.
+
+    What an aligned shape differs by is orthogonal to all ways of moving, turning and enlarging the
+    mean: the sum of the mean and of such differences is aligned as it is.
 
     Returns:
         The aligned shapes, (T, N, 2), and their poses, (T, 4): ``place(poses, aligned)`` gives the
         shapes back.
     """
-    to_mean = fit_pose(shapes, np.broadcast_to(mean, shapes.shape))
-    return place(to_mean, shapes), inverse_pose(to_mean)
+    poses = fit_pose(np.broadcast_to(mean, shapes.shape), shapes)
+    return place(inverse_pose(poses), shapes), poses
 
 
 def procrustes_mean(shapes: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Appearance models as slow, obvious versions: a full SVD, one pixel after the other, dense solves."""
+"""Appearance models as slow, obvious versions: a full SVD, pixel after pixel, dense solves."""
 
 import numpy as np
 

@@ -64,7 +64,7 @@ def test_a_light_is_found_taken_off_and_put_back():
 
 def test_a_light_in_which_nothing_is_seen_is_an_error():
     light = fit_light(np.full((40, 3), 0.5, np.float32), some_texture())
-    with pytest.raises(InputError, match="c.mp4, frame 3: what lies between the landmarks"):
+    with pytest.raises(InputError, match=r"c\.mp4, frame 3: what lies between the landmarks"):
         check_light(light, "c.mp4, frame 3")
 
 

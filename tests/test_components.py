@@ -10,7 +10,9 @@ def some_rows(count, columns, *, ways=None, seed=0):
     """Rows (S, D) of zero mean that vary in `ways`, each less than the one before."""
     rng = np.random.default_rng(seed)
     ways = min(count - 1, columns) if ways is None else ways
-    rows = rng.normal(size=(count, ways)) * 0.7 ** np.arange(ways) @ rng.normal(size=(ways, columns))
+    rows = (
+        rng.normal(size=(count, ways)) * 0.7 ** np.arange(ways) @ rng.normal(size=(ways, columns))
+    )
     return rows - rows.mean(axis=0)
 
 

@@ -71,7 +71,10 @@ def spoilt(t, i, value):
 @pytest.mark.parametrize(
     ("points", "says"),
     [
-        (spoilt(2, ROWS[5], (-1, 9)), r"frame 2: landmark at \(-1\.0, 9\.0\) is outside .* 64 x 48"),
+        (
+            spoilt(2, ROWS[5], (-1, 9)),
+            r"frame 2: landmark at \(-1\.0, 9\.0\) is outside .* 64 x 48",
+        ),
         (spoilt(1, ROWS[5], (9, 47.5)), r"frame 1: .* is outside the picture"),
         (spoilt(1, 0, (np.nan, 9)), "must hold finite numbers"),
         ([SHAPE] * 3, r"must hold points of shape \(4, 103 or more, 2\), has \(3, 103, 2\)"),
@@ -135,7 +138,9 @@ def test_frames_by_hand_must_have_one_number_of_points(clip, tmp_path):
 
 def test_a_row_that_hand_labels_lack_is_said(clip, tmp_path):
     save_json(tmp_path, by_hand(0))
-    with pytest.raises(InputError, match=r"has 5 landmarks a frame, 103 are needed; .*--all-points"):
+    with pytest.raises(
+        InputError, match=r"has 5 landmarks a frame, 103 are needed; .*--all-points"
+    ):
         read_labelled_clip(clip, tmp_path, ROWS)
 
 

@@ -40,15 +40,24 @@ def test_an_inverse_pose_undoes_its_pose():
     assert_allclose(size_of(inverse_pose(pose)), 1 / size_of(pose), rtol=1e-12)
 
 
-def test_no_similarity_brings_an_aligned_shape_nearer():
+def test_no_similarity_brings_the_mean_nearer_to_an_aligned_shape():
     shapes, shape, _ = some_shapes(3, noise=5)
     aligned, poses = align(shapes, shape)
     assert_allclose(place(poses, aligned), shapes, rtol=1e-9, atol=1e-9)
     best = ((aligned - shape) ** 2).sum(axis=(1, 2))
     rng = np.random.default_rng(1)
     for _ in range(20):
-        other = place(np.array([1.0, 0, 0, 0]) + rng.normal(0, 0.01, 4), aligned)
-        assert (((other - shape) ** 2).sum(axis=(1, 2)) > best).all()
+        other = place(np.array([1.0, 0, 0, 0]) + rng.normal(0, 0.01, 4), shape)
+        assert (((other - aligned) ** 2).sum(axis=(1, 2)) > best).all()
+
+
+def test_sums_of_the_mean_and_of_differences_from_it_are_aligned():
+    shapes, shape, _ = some_shapes(3, noise=5)
+    aligned, _ = align(shapes, shape)
+    made = shape + np.tensordot([0.3, -1.2, 2.0], aligned - shape, axes=1)
+    again, (pose,) = align(made[None], shape)
+    assert_allclose(again[0], made, atol=1e-9)
+    assert_allclose(pose, [1, 0, 0, 0], atol=1e-9)
 
 
 def test_the_mean_of_one_shape_in_many_places_is_that_shape():
