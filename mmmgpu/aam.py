@@ -34,6 +34,7 @@ __all__ = [
     "complete_clip",
     "features",
     "fit_aam",
+    "labelled_clip",
     "load_aam",
     "match",
     "prepare_fitting",
@@ -121,14 +122,24 @@ def complete_clip(aam: Aam, clip: Path, landmarks: Path) -> LabelledClip:
     """`clip` with the landmarks that the model uses, in every frame.
 
     Raises:
-        InputError: Some frames have none, or there are more or fewer than the model has points.
+        InputError: Some frames have none, or `labelled_clip` refuses it.
     """
-    labelled = read_labelled_clip(Path(clip), Path(landmarks), aam.rows)
+    labelled = labelled_clip(aam, clip, landmarks)
     if not labelled.is_complete:
         raise InputError(
             f"{labelled.path}: only {len(labelled.frames)} of {labelled.info.frames} frames have "
             "landmarks; label the others too"
         )
+    return labelled
+
+
+def labelled_clip(aam: Aam, clip: Path, landmarks: Path) -> LabelledClip:
+    """`clip` with the landmarks that the model uses, in some frames at least.
+
+    Raises:
+        InputError: There are more or fewer in a frame than the model has points.
+    """
+    labelled = read_labelled_clip(Path(clip), Path(landmarks), aam.rows)
     number = len(aam.mesh.vertices)
     if labelled.points.shape[1] != number:
         raise InputError(

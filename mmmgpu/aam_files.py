@@ -23,6 +23,7 @@ from mmmgpu.tensor_files import (
 
 KIND = FileKind("mmmgpu-aam", 1, "appearance model", "mmmgpu aam", "make it again")
 ARRAYS = (
+    "steadiness",
     "shape_modes",
     "shape_variance",
     "texture_mean",
@@ -65,6 +66,7 @@ def _assemble(path: Path, tensors: Tensors, facts: Facts) -> Aam:
     number, pixels = len(mesh.vertices), len(mesh.pixels.index)
     k, m, n = (len(tensors[name]) for name in ("shape_variance", "texture_variance", "variance"))
     wanted = {
+        "steadiness": ((number,), "f8"),
         "shape_modes": ((k, number, 2), "f8"),
         "shape_variance": ((k,), "f8"),
         "texture_mean": ((pixels, 3), "f4"),
@@ -75,7 +77,7 @@ def _assemble(path: Path, tensors: Tensors, facts: Facts) -> Aam:
         "variance": ((n,), "f8"),
     }
     check_tensors(path, KIND, tensors, wanted)
-    for name in ("shape_variance", "texture_variance", "variance"):
+    for name in ("steadiness", "shape_variance", "texture_variance", "variance"):
         if not (len(tensors[name]) and (tensors[name] > 0).all()):
             raise InputError(f"{path}: tensor {name} must be above zero; {KIND.remedy}")
     rows = facts["rows"]

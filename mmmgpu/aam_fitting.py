@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.appearances import (
     Aam,
+    aligned,
     enlarge_points,
     fit_light,
     project,
@@ -36,7 +37,7 @@ from mmmgpu.appearances import (
 from mmmgpu.backends import Backend
 from mmmgpu.errors import InputError
 from mmmgpu.meshes import Mesh, Pixels, rasterize
-from mmmgpu.shapes import align, place
+from mmmgpu.shapes import place
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -137,7 +138,7 @@ def match(fitter: Fitter, frame: NDArray[np.uint8], start: Floats, kernels: Back
     texture = read_texture(aam.mesh, picture, points, kernels)
     light = fit_light(texture, aam.texture_mean)
     plain = take_light_off(texture, _visible(light))
-    (shape,), (pose,) = align(points[None], aam.mesh.vertices)
+    (shape,), (pose,) = aligned(aam, points[None])
     c = project(aam, shape, plain)
     n = len(aam.variance)
     missed = (plain - aam.texture_mean).ravel() - c @ aam.modes_of_texture.reshape(n, -1)
@@ -188,7 +189,7 @@ def compose(fitter: Fitter, points: Floats, change: Floats) -> Floats:
     affine = _sides(mesh, points) @ fitter.inverse_sides  # (K, 2, 2)
     at_vertex = np.tensordot(fitter.shares, affine, axes=1)
     moved = points + (at_vertex @ back[..., None])[..., 0]
-    (shape,), (pose,) = align(moved[None], mesh.vertices)
+    (shape,), (pose,) = aligned(aam, moved[None])
     b = np.tensordot(aam.shape_modes, shape - mesh.vertices, axes=2)
     limit = FARTHEST * np.sqrt(aam.shape_variance)
     model = mesh.vertices + np.tensordot(np.clip(b, -limit, limit), aam.shape_modes, axes=1)
@@ -197,7 +198,7 @@ def compose(fitter: Fitter, points: Floats, change: Floats) -> Floats:
 
 def _shape_of(aam: Aam, points: Floats) -> Floats:
     """b (K,) of points (N, 2) of the reduced picture."""
-    (shape,), _ = align(points[None], aam.mesh.vertices)
+    (shape,), _ = aligned(aam, points[None])
     return np.tensordot(aam.shape_modes, shape - aam.mesh.vertices, axes=2)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.appearances import (
     Aam,
+    aligned,
     check_light,
     enlarge_points,
     fit_light,
@@ -24,13 +25,14 @@ from mmmgpu.appearances import (
 )
 from mmmgpu.backends import Backend
 from mmmgpu.meshes import Ints, Mesh, Pixels, rasterize
-from mmmgpu.shapes import align, place
+from mmmgpu.shapes import place
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 RING = 1.35  # size of the ring that stays, about the outline
+GREY = 128  # about a face that is drawn alone
 FADE = 0.03  # of the outline's width: over so much the face fades into the frame
 
 
@@ -49,10 +51,25 @@ def render_face(
     texture = read_texture(aam.mesh, reduce_picture(frame, aam.reduction), at, kernels)
     light = fit_light(texture, aam.texture_mean)
     check_light(light, where)
-    _, (pose,) = align(at[None], aam.mesh.vertices)
+    _, (pose,) = aligned(aam, at[None])
     wanted = enlarge_points(place(pose, synthesize_shape(aam, features)), aam.reduction)
     colours = put_light_on(synthesize_texture(aam, features), light)
     return _compose(aam.mesh, frame, (points, wanted), colours, kernels)
+
+
+def draw_face(aam: Aam, features: Floats, kernels: Backend, *, scale: float = 3.0) -> Picture:
+    """The face of `features` (n,) alone, on grey, `scale` times as large as the mean shape's
+    picture, uint8 (h, w, 3); it stands there as the mean shape does.
+    """
+    mesh, margin = aam.mesh, max(aam.mesh.shape) // 8
+    shape = synthesize_shape(aam, features) + margin
+    height, width = (round(scale * (n + 2 * margin)) for n in mesh.shape)
+    pixels = rasterize(enlarge_points(shape, scale), mesh.triangles, (height, width))
+    texture = _texture_picture(mesh, synthesize_texture(aam, features), kernels)
+    colours = _read(texture, mesh.vertices, mesh.triangles, pixels, kernels)
+    picture = np.full((height * width, 3), GREY, np.uint8)
+    picture[pixels.place] = np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)
+    return picture.reshape(height, width, 3)
 
 
 def _compose(

@@ -22,7 +22,7 @@ from mmmgpu.appearances import (
 from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.components import Components, gram_of, principal_components
 from mmmgpu.errors import InputError
-from mmmgpu.labelled_clips import ROWS, LabelledClip, Rows, read_labelled_clips
+from mmmgpu.labelled_clips import ROWS, LabelledClip, Rows, read_labelled_clips, steadiness
 from mmmgpu.meshes import Mesh, doubled_areas, fold_depths, make_mesh, triangulate
 from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.progress import progress
@@ -71,9 +71,10 @@ def fit_aam(
         sample = _spread(labelled, frames)
         points = np.concatenate([c.points[i] for c, i in zip(labelled, sample, strict=True)])
         _check_number(len(points), parameters if variance is None else 1)
-        mesh, reduction = _mean_mesh(points)
+        steady = steadiness(rows, points.shape[1])
+        mesh, reduction = _mean_mesh(points, steady)
         _check_folds(labelled, mesh, reduction)
-        shapes, _ = align(reduce_points(points, reduction), mesh.vertices)
+        shapes, _ = align(reduce_points(points, reduction), mesh.vertices, steady)
         if np.ptp(shapes, axis=0).max() < STILL:
             raise InputError("the landmarks never move; give frames that differ")
         textures = _read_textures(labelled, sample, mesh, reduction, backend)
@@ -88,6 +89,7 @@ def fit_aam(
         k, m = shape.count_for(SHAPE_SHARE), min(TEXTURES, len(texture.variance))
         return Aam(
             mesh=mesh,
+            steadiness=steady,
             rows=rows,
             reduction=reduction,
             shape_modes=shape.modes(s, k).reshape(k, -1, 2),
@@ -138,9 +140,9 @@ def _names(labelled: Sequence[LabelledClip], sample: Sequence[Numbers]) -> list[
     return [f"{c.path}, frame {c.frames[i]}" for c, chosen in pairs for i in chosen]
 
 
-def _mean_mesh(points: Floats) -> tuple[Mesh, int]:
+def _mean_mesh(points: Floats, steady: Floats) -> tuple[Mesh, int]:
     """The mesh of the mean of shapes (S, N, 2) [px], and by which factor frames are reduced."""
-    mean = procrustes_mean(points)
+    mean = procrustes_mean(points, steady)
     area = float(np.abs(doubled_areas(mean, triangulate(mean))).sum()) / 2
     reduction = max(1, int(np.ceil(np.sqrt(area / LARGEST))))
     return make_mesh(mean / reduction), reduction
@@ -150,8 +152,7 @@ def _check_folds(labelled: Sequence[LabelledClip], mesh: Mesh, reduction: int) -
     """No triangle is turned over by more than jitter can."""
     size = np.sqrt(((mesh.vertices - mesh.vertices.mean(axis=0)) ** 2).sum(axis=1).mean())
     for clip in labelled:
-        shapes, _ = align(reduce_points(clip.points, reduction), mesh.vertices)
-        depth = fold_depths(shapes, mesh.triangles)
+        depth = fold_depths(clip.points / reduction, mesh.triangles)
         if depth.max(initial=0) > FOLDED * size:
             t, k = np.unravel_index(int(depth.argmax()), depth.shape)
             raise InputError(

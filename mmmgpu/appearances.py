@@ -37,6 +37,7 @@ class Aam:
     """An active appearance model of one person; N points, P pixels, n parameters.
 
     mesh: the mean shape, its triangles and pixels.
+    steadiness: weights of the points where a pose is found, (N,).
     rows: which landmarks of a frame the points are; None: all.
     reduction: frames are averaged over squares of so many pixels before anything else.
     shape_modes, shape_variance: P_k, (K, N, 2) [px of the mesh], and their variances, (K,).
@@ -50,6 +51,7 @@ class Aam:
     """
 
     mesh: Mesh
+    steadiness: Floats
     rows: tuple[int, ...] | None
     reduction: int
     shape_modes: Floats
@@ -80,6 +82,11 @@ class Seen:
 
     def __len__(self) -> int:
         return len(self.features)
+
+
+def aligned(aam: Aam, points: Floats) -> tuple[Floats, Floats]:
+    """Points (T, N, 2) of reduced pictures in the frame of the mesh, and their poses (T, 4)."""
+    return align(points, aam.mesh.vertices, aam.steadiness)
 
 
 def reduce_picture(picture: Picture, factor: int) -> F32:
@@ -168,7 +175,7 @@ def see(
     Raises:
         InputError: There is no such face between the landmarks.
     """
-    shapes, poses = align(reduce_points(points, aam.reduction), aam.mesh.vertices)
+    shapes, poses = aligned(aam, reduce_points(points, aam.reduction))
     features, lights = [], []
     for t, (frame, p, shape) in enumerate(zip(frames, points, shapes, strict=True)):
         picture = reduce_picture(frame, aam.reduction)

@@ -24,8 +24,22 @@ Rows = tuple[int, ...]
 
 FORMAT, VERSION = "mmmgpu-landmarks", 1
 ROWS: Rows = LANDMARK_ROWS  # lips, jaw, nose and cheeks: the 38 of a tracker's 103
+STEADY: Rows = (42, 44, 56, 58, 68, 69, 70, 71, 72, 87, 88)  # of a tracker's: they do not speak
+UNSTEADY = 0.01  # weight of all others where the pose of the head is found
 FEWEST = 3  # points
 LEAST_SPREAD = 0.05  # of the points across their main direction: less is a line
+
+
+def steadiness(rows: Rows | None, number: int) -> Floats:
+    """Weights of a frame's `number` points where the pose of the head is found, (N,).
+
+    Of a tracker's landmarks the upper jaw, the nose and the cheeks, which an open mouth does not
+    move; points of which nothing is known weigh the same.
+    """
+    steady = np.array([row in STEADY for row in rows or ()])
+    if steady.sum() < FEWEST:
+        return np.ones(number)
+    return np.where(steady, 1.0, UNSTEADY)
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,19 @@ SETTLED = 1e-10  # change of the mean as a share of its size at which Procrustes
 ITERATIONS = 100  # of it at most; 5 to 10 are usual
 
 
-def fit_pose(source: Floats, target: Floats) -> Floats:
+def fit_pose(source: Floats, target: Floats, weights: Floats) -> Floats:
     """The pose of least squares that carries `source` to `target`, (..., N, 2) both: (..., 4).
 
-    |T(source) - target|^2 is least over all similarities (no mirror images).
+    sum_i w_i |T(source_i) - target_i|^2 is least over all similarities (no mirror images).
+
+    weights: w, (N,), above 0.
     """
-    mean, middle = source.mean(axis=-2), target.mean(axis=-2)
+    w = weights / weights.sum()
+    mean, middle = w @ source, w @ target
     x, y = source - mean[..., None, :], target - middle[..., None, :]
-    power = (x**2).sum(axis=(-2, -1))
-    a = (x * y).sum(axis=(-2, -1)) / power
-    b = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).sum(axis=-1) / power
+    power = ((x**2).sum(axis=-1) * w).sum(axis=-1)
+    a = ((x * y).sum(axis=-1) * w).sum(axis=-1) / power
+    b = ((x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]) * w).sum(axis=-1) / power
     turned = _turn(a, b, mean[..., None, :])[..., 0, :]
     return np.concatenate([np.stack([a, b], axis=-1), middle - turned], axis=-1)
 
@@ -59,33 +62,37 @@ def _turn(a: Floats, b: Floats, points: Floats) -> Floats:
     return np.stack([a * x - b * y, b * x + a * y], axis=-1)
 
 
-def align(shapes: Floats, mean: Floats) -> tuple[Floats, Floats]:
+def align(shapes: Floats, mean: Floats, weights: Floats) -> tuple[Floats, Floats]:
     """`shapes` (T, N, 2) in the frame of `mean` (N, 2), by the poses that carry it nearest to them.
 
-    What an aligned shape differs by is orthogonal to all ways of moving, turning and enlarging the
-    mean: the sum of the mean and of such differences is aligned as it is.
+    What an aligned shape differs by is orthogonal (weighted) to all ways of moving, turning and
+    enlarging the mean: the sum of the mean and of such differences is aligned as it is.
+
+    weights: of the points, (N,); see `fit_pose`.
 
     Returns:
         The aligned shapes, (T, N, 2), and their poses, (T, 4): ``place(poses, aligned)`` gives the
         shapes back.
     """
-    poses = fit_pose(np.broadcast_to(mean, shapes.shape), shapes)
+    poses = fit_pose(np.broadcast_to(mean, shapes.shape), shapes, weights)
     return place(inverse_pose(poses), shapes), poses
 
 
-def procrustes_mean(shapes: Floats) -> Floats:
+def procrustes_mean(shapes: Floats, weights: Floats) -> Floats:
     """The mean shape of generalised Procrustes analysis, (T, N, 2) -> (N, 2) [px].
 
     Every shape is brought to the mean, the mean is taken anew, until it stays. Its centre is the
     origin, it stands as the first shape does, and its size is the shapes' mean size.
+
+    weights: of the points, (N,); see `fit_pose`.
     """
     centred = shapes - shapes.mean(axis=1, keepdims=True)
     size = np.sqrt((centred**2).sum(axis=(1, 2))).mean()
     mean = centred[0] * (size / np.linalg.norm(centred[0]))
     for _ in range(ITERATIONS):
-        moved, _ = align(centred, mean)
+        moved, _ = align(centred, mean, weights)
         new = moved.mean(axis=0)
-        new = place(fit_pose(new, centred[0]), new)  # or it would slowly turn
+        new = place(fit_pose(new, centred[0], weights), new)  # or it would slowly turn
         new = (new - new.mean(axis=0)) * (size / np.linalg.norm(new - new.mean(axis=0)))
         settled = np.linalg.norm(new - mean) <= SETTLED * size
         mean = new

@@ -3,12 +3,12 @@
 import numpy as np
 
 
-def similarity(source, target):
+def similarity(source, target, weights):
     """(a, b, t_x, t_y) that carries points (N, 2) to others best: a dense least-squares system."""
     rows, values = [], []
-    for (x, y), (u, v) in zip(source, target, strict=True):
-        rows += [[x, -y, 1, 0], [y, x, 0, 1]]
-        values += [u, v]
+    for (x, y), (u, v), w in zip(source, target, np.sqrt(weights), strict=True):
+        rows += [[w * x, -w * y, w, 0], [w * y, w * x, 0, w]]
+        values += [w * u, w * v]
     return np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0]
 
 

@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from worlds import POSTURES, hold
 
 from mmmgpu.aam_rendering import RING, render_face
 from mmmgpu.appearances import see
 from mmmgpu.backends import get_backend
 from mmmgpu.errors import InputError
 from mmmgpu.landmarks import mouth_hull
+from mmmgpu.performer import landmarks, render
 from mmmgpu.pictures import psnr
 
 WARP = get_backend("warp", 1)
@@ -42,6 +44,18 @@ def test_what_lies_beyond_the_ring_keeps_its_bits(drawn):
     outside[max(low[1], 0) : high[1] + 1, max(low[0], 0) : high[0] + 1] = False
     assert_array_equal(made[outside], frame[outside])
     assert (made != frame).any()
+
+
+def test_a_face_takes_on_what_another_frame_shows(drawn, world):
+    """The head keeps still; one frame closed, one with the mouth wide open."""
+    motion = hold(POSTURES[0], POSTURES[1])
+    closed, opened = render(world.face, motion)
+    rows = list(drawn.aam.rows)
+    at_closed, at_opened = (landmarks(world.face, motion, t)[rows] for t in (0, 1))
+    c = own_features(drawn, opened, at_opened)
+    made = render_face(drawn.aam, closed, at_closed, c, WARP, where="x")
+    near = mouth_hull(at_opened[5:], closed.shape)
+    assert psnr(made, opened, near) > psnr(closed, opened, near) + 5
 
 
 def test_the_frame_is_not_changed(drawn):

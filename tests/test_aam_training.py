@@ -8,10 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu import aam_training
 from mmmgpu.aam_training import fit_aam
-from mmmgpu.appearances import fit_light, read_texture, reduce_picture, take_light_off
+from mmmgpu.appearances import aligned, fit_light, read_texture, reduce_picture, take_light_off
 from mmmgpu.backends import get_backend
 from mmmgpu.errors import InputError
-from mmmgpu.shapes import align
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def few(drawn, tmp_path_factory):
         picture = reduce_picture(drawn.frame(drawn.clips[clip], t), 1)
         texture = read_texture(aam.mesh, picture, points, get_backend("numpy"))
         textures.append(take_light_off(texture, fit_light(texture, aam.texture_mean)))
-        shapes.append(align(points[None], aam.mesh.vertices)[0][0])
+        shapes.append(aligned(aam, points[None])[0][0])
     return aam, np.array(shapes), np.array(textures)
 
 

@@ -6,7 +6,7 @@ from media import encode, grey_levels
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu.errors import InputError
-from mmmgpu.labelled_clips import ROWS, read_labelled_clip, read_labelled_clips
+from mmmgpu.labelled_clips import ROWS, read_labelled_clip, read_labelled_clips, steadiness
 
 FRAMES = 4
 SHAPE = 5 + 30 * np.random.default_rng(0).random((103, 2))
@@ -153,3 +153,18 @@ def test_clips_go_together(clip, tmp_path):
         read_labelled_clips([clip, tmp_path / "sub" / "a b.mp4"], tmp_path, None)
     with pytest.raises(InputError, match="no clip given"):
         read_labelled_clips([], tmp_path, None)
+
+
+def test_what_does_not_speak_says_where_the_head_is():
+    weights = dict(zip(ROWS, steadiness(ROWS, len(ROWS)), strict=True))
+    assert {row for row, weight in weights.items() if weight == 1} == {
+        *(42, 44, 56, 58),
+        *(68, 69, 70, 71, 72),
+        *(87, 88),
+    }
+    assert max(weights[row] for row in (0, 10, 25, 50, 102)) < 0.1
+
+
+@pytest.mark.parametrize("rows", [None, (0, 5, 10, 68, 71)])
+def test_points_of_which_too_little_is_known_weigh_the_same(rows):
+    assert_array_equal(steadiness(rows, 5), np.ones(5))
