@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mmmgpu import performer
+    from mmmgpu import aam, performer
     from mmmgpu.adaptation import adapt
     from mmmgpu.aligner import align_speech
     from mmmgpu.alignments import Alignment, Segment, read_alignment
@@ -42,6 +42,7 @@ __all__ = [
     "Model",
     "Segment",
     "__version__",
+    "aam",
     "adapt",
     "align_speech",
     "blend",
@@ -65,6 +66,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "aam": [],  # the module itself
     "adaptation": ["adapt"],
     "aligner": ["align_speech"],
     "alignments": ["Alignment", "Segment", "read_alignment"],
