@@ -8,8 +8,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu import aam_fitting
 from mmmgpu.aam_fitting import compose, match, prepare_fitting, warp_jacobian
-from mmmgpu.aam_rendering import render_face
-from mmmgpu.appearances import aligned, read_texture, reduce_picture, see, synthesize_shape
+from mmmgpu.aam_rendering import _texture_picture, render_face
+from mmmgpu.appearances import (
+    aligned,
+    read_texture,
+    reduce_picture,
+    reduce_points,
+    see,
+    synthesize_shape,
+)
 from mmmgpu.backends import get_backend
 from mmmgpu.errors import InputError
 from mmmgpu.shapes import place
@@ -97,6 +104,20 @@ def test_a_step_is_that_of_dense_least_squares(drawn, fitter):
     prior = np.concatenate([np.zeros(4), aam_fitting.PRIOR / aam.shape_variance])
     desired = oracles.gauss_newton_step(descent, hidden, missed, shape, prior)
     assert_allclose(level.step @ missed + level.pull @ shape, desired, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("step", [(0.3, 0.0), (0.0, -0.3), (-0.2, 0.2)])
+def test_one_step_goes_most_of_the_way_at_every_size(drawn, fitter, step):
+    """In the mean picture itself, from the mean shape moved a little."""
+    mesh = drawn.aam.mesh
+    picture = _texture_picture(mesh, drawn.aam.texture_mean, WARP)
+    frame = np.rint(255 * picture.clip(0, 1)).astype(np.uint8)
+    for level in fitter.levels:
+        points = mesh.vertices + np.array(step)
+        reduced = reduce_picture(frame, level.factor)
+        texture = read_texture(level.mesh, reduced, reduce_points(points, level.factor), WARP)
+        new = compose(fitter, points, level.step @ (texture - level.mean).ravel())
+        assert rms(new, mesh.vertices) < 0.45 * rms(points, mesh.vertices)
 
 
 def test_what_modes_and_lights_explain_moves_nothing(drawn, fitter):
