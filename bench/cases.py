@@ -65,7 +65,31 @@ def rbf(rng, height=256, width=256, number=38):
     return Case(name, "evaluate_rbf", tuple(a.astype(np.float32) for a in arrays), (0.003,))
 
 
-CASES: list[Callable[[np.random.Generator], Case]] = [splat, fill, blend, sample, scan, rbf]
+def piecewise(rng, height=288, width=360, batch=16, across=8):
+    """A mesh of 2 x 7 x 7 triangles over 64 x 72 pixels, and where it is found in 16 pictures."""
+    field = rng.random((batch, height, width, 3), dtype=np.float32)
+    y, x = np.mgrid[:across, :across].reshape(2, -1)
+    grid = np.stack([120 + x * 10.2, 150 + y * 9.0], axis=-1)
+    vertices = (grid + rng.normal(0, 1, (batch, across**2, 2))).astype(np.float32)
+    corner = (np.arange(across - 1)[:, None] * across + np.arange(across - 1)).ravel()
+    upper = np.stack([corner, corner + 1, corner + across], axis=1)
+    lower = np.stack([corner + 1, corner + across + 1, corner + across], axis=1)
+    triangles = np.concatenate([upper, lower]).astype(np.int32)
+    index = np.repeat(np.arange(len(triangles)), 47).astype(np.int32)
+    barycentric = rng.dirichlet(np.ones(3), len(index)).astype(np.float32)
+    arrays = field, vertices, triangles, index, barycentric
+    return Case("piecewise_warp 16 x 4606 pixels", "piecewise_warp", arrays)
+
+
+CASES: list[Callable[[np.random.Generator], Case]] = [
+    splat,
+    fill,
+    blend,
+    sample,
+    scan,
+    rbf,
+    piecewise,
+]
 
 
 @dataclass(frozen=True)

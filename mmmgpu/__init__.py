@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mmmgpu import performer
+    from mmmgpu import aam, performer
     from mmmgpu.adaptation import adapt
     from mmmgpu.aligner import align_speech
     from mmmgpu.alignments import Alignment, Segment, read_alignment
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         evaluate_rbf,
         fill_holes,
         forward_warp,
+        piecewise_warp,
         sample,
     )
     from mmmgpu.reconstruction import reconstruct
@@ -41,6 +42,7 @@ __all__ = [
     "Model",
     "Segment",
     "__version__",
+    "aam",
     "adapt",
     "align_speech",
     "blend",
@@ -52,6 +54,7 @@ __all__ = [
     "get_backend",
     "load",
     "performer",
+    "piecewise_warp",
     "rbf_correspondence",
     "read_alignment",
     "reconstruct",
@@ -63,6 +66,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "aam": [],  # the module itself
     "adaptation": ["adapt"],
     "aligner": ["align_speech"],
     "alignments": ["Alignment", "Segment", "read_alignment"],
@@ -78,6 +82,7 @@ _HOMES = {
         "evaluate_rbf",
         "fill_holes",
         "forward_warp",
+        "piecewise_warp",
         "sample",
     ],
     "performer": [],  # the module itself

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mmmgpu.errors import InputError
 
 F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
 LARGEST = 2**31 - 1  # elements; the kernels count in int32
 
 
@@ -37,6 +38,28 @@ def as_float32(name: str, array: ArrayLike, *axes: str | int) -> F32:
     if not (math.isfinite(a.min(initial=0)) and math.isfinite(a.max(initial=0))):
         raise InputError(f"{name} holds NaN or infinite values (as float32); remove or mask them")
     return a
+
+
+def as_indices(name: str, array: ArrayLike, below: int, *axes: str | int) -> I32:
+    """`array` as C-order int32, after checking that it holds whole numbers 0 ... `below` - 1.
+
+    Args:
+        name: The argument's name, for the error.
+        array: Whole numbers, any real dtype.
+        below: How many things there are to choose from.
+        axes: As for `as_float32`.
+
+    Raises:
+        InputError: As `as_float32`; also numbers that are not whole, or out of range.
+    """
+    given = _numeric(name, array)
+    _check_shape(name, given.shape, axes)
+    if not np.isfinite(given).all():
+        raise InputError(f"{name} holds NaN or infinite values; remove or mask them")
+    bad = given[(given != np.floor(given)) | (given < 0) | (given >= below)]
+    if bad.size:
+        raise InputError(f"{name} must hold whole numbers from 0 to {below - 1}, got {bad.flat[0]}")
+    return np.asarray(given, dtype=np.int32, order="C")
 
 
 def _numeric(name: str, array: ArrayLike) -> NDArray[Any]:

@@ -9,6 +9,7 @@ import typer
 
 from mmmgpu import __version__
 from mmmgpu.commands import (
+    aam,
     adapt,
     align,
     compare,
@@ -59,6 +60,7 @@ def _common(
 for _command, _example in (
     (demo.demo, demo.EXAMPLE),
     (align.align, align.EXAMPLE),
+    (aam.aam, aam.EXAMPLE),
     (train.train, train.EXAMPLE),
     (reconstruct.reconstruct, reconstruct.EXAMPLE),
     (speak.speak, speak.EXAMPLE),

@@ -1,4 +1,6 @@
-"""Landmarks of a face tracker, for measuring only: no training reads them.
+"""Landmarks of a face tracker, to measure with and to make appearance models from.
+
+The training of a morphable model never reads them.
 
 ``NAME.npz`` beside a clip holds ``points``, float32 (frames, 103, 2), (x, y) [px]: outer lip 0-19
 from the right corner along the lower lip, inner lip 20-39, then jaw, nose, eyes and cheeks.
@@ -31,8 +33,12 @@ LOWER, UPPER = 5, 15  # middle of the outer lower and upper lip
 HULL_SCALE = 1.5  # of the outer lip's hull, about its centre: where pictures are compared
 
 
-def read_landmarks(folder: Path, clip: Path, frames: int | None = None) -> Floats:
+def read_landmarks(
+    folder: Path, clip: Path, frames: int | None = None, *, least: int = LIPS.stop
+) -> Floats:
     """The landmarks of `clip`, (frames, n, 2) [px]; of any number of frames if None.
+
+    least: how many landmarks a frame must have, n; by default those of the lips.
 
     Raises:
         InputError: There are none, or not for so many frames, or some are not finite.
@@ -44,9 +50,9 @@ def read_landmarks(folder: Path, clip: Path, frames: int | None = None) -> Float
     except _UNREADABLE as e:
         raise InputError(f"{path}: no landmarks of {clip} ({e}); give --landmarks DIR") from e
     wanted = (len(points) if frames is None and points.ndim else frames, 2)
-    if points.ndim != 3 or (len(points), points.shape[2]) != wanted or points.shape[1] < 40:
+    if points.ndim != 3 or (len(points), points.shape[2]) != wanted or points.shape[1] < least:
         raise InputError(
-            f"{path}: must hold points of shape ({frames or 'frames'}, 40 or more, 2), "
+            f"{path}: must hold points of shape ({frames or 'frames'}, {least} or more, 2), "
             f"has {points.shape}"
         )
     if points.dtype.kind not in "fiu" or not np.isfinite(points).all():

@@ -1,13 +1,11 @@
 """Models on disk: one safetensors file, checked before it is used. No pickle anywhere.
 
-Tensors are flat and named after the fields of `Model`; what is no array lies, with ``format`` and
-``version``, as JSON in the header's one entry ``mmmgpu`` (several would come in random order, and
-the same model would not be the same bytes).
+Tensors are flat and named after the fields of `Model`; how such files are written and read is in
+`mmmgpu.tensor_files`.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from fractions import Fraction
@@ -15,36 +13,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mmmgpu.basis import Basis
 from mmmgpu.dynamics import Dynamics, facts_of, model_of
 from mmmgpu.errors import InputError
-from mmmgpu.files import write_bytes
 from mmmgpu.flat_records import tensors_of
 from mmmgpu.models import Calm, Model
 from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.regions import Region
 from mmmgpu.registration import Head
+from mmmgpu.tensor_files import FileKind, Tensors, check_tensors, read_tensors, write_tensors
 from mmmgpu.tracks import Reference, Track
 from mmmgpu.trajectory_training import Constants, History, TrainedStream
 
-Tensors = dict[str, NDArray[Any]]
-
-HEADER = "mmmgpu"
 FORMAT = "mmmgpu-model"
 VERSION = 1
 STREAMS = ("alpha", "beta")
+KIND = FileKind(FORMAT, VERSION, "model", "mmmgpu train", "train it again")
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write `model` to `path`, whole or not at all."""
-    from safetensors.numpy import save
-
-    facts = {"format": FORMAT, "version": VERSION, **_facts(model)}
-    header = {HEADER: json.dumps(facts, ensure_ascii=False, allow_nan=False)}
-    tensors = {name: np.ascontiguousarray(value) for name, value in _tensors(model).items()}
-    write_bytes(path, save(tensors, metadata=header))  # its save_file hides why it fails
+    write_tensors(path, KIND, _facts(model), _tensors(model))
 
 
 def load(path: str | os.PathLike[str]) -> Model:
@@ -54,40 +44,13 @@ def load(path: str | os.PathLike[str]) -> Model:
         InputError: No such file, not a model, truncated, of a newer version, or with tensors that
             are missing, misshapen or not finite.
     """
-    from safetensors import SafetensorError, safe_open
-
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such model file; train one with: mmmgpu train")
-    try:
-        with safe_open(str(path), framework="numpy") as file:
-            facts = _read_header(path, (file.metadata() or {}).get(HEADER, "null"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        _check_facts(path, facts)
-        _check_tensors(path, tensors, facts)
-        return _assemble(tensors, facts)
-    except InputError:
-        raise
-    except (SafetensorError, OSError) as e:
-        raise InputError(f"{path}: truncated, damaged or not a model ({e}); train it again") from e
-    except (LookupError, TypeError, ValueError, AttributeError) as e:  # of a header like no other
-        raise InputError(f"{path}: the model lacks or misstates {e}; train it again") from e
+    return read_tensors(path, KIND, _checked)
 
 
-def _read_header(path: Path, text: str) -> dict[str, Any]:
-    try:
-        facts = json.loads(text)
-    except json.JSONDecodeError:
-        facts = None
-    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise InputError(f"{path}: not a mmmgpu model; give a file that mmmgpu train has written")
-    version = facts.get("version")
-    if type(version) is not int or not 1 <= version <= VERSION:
-        raise InputError(
-            f"{path}: has format version {version}, this mmmgpu reads up to {VERSION}; "
-            "update mmmgpu"
-        )
-    return facts
+def _checked(path: Path, tensors: Tensors, facts: dict[str, Any]) -> Model:
+    _check_facts(path, facts)
+    _check_tensors(path, tensors, facts)
+    return _assemble(tensors, facts)
 
 
 def _check_facts(path: Path, facts: dict[str, Any]) -> None:
@@ -146,15 +109,9 @@ def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
             wanted[f"{name}.covariance"] = ((phones, d, d), "f8")
         for other in facts["alternatives"]:
             wanted[f"{name}.{other}.mean"] = ((phones, d), "f8")
-    for name, (shape, kind) in wanted.items():
+    check_tensors(path, KIND, tensors, wanted)
+    for name in wanted:
         tensor = tensors[name]
-        if tensor.shape != shape or tensor.dtype != np.dtype(kind):
-            raise InputError(
-                f"{path}: tensor {name} must be {np.dtype(kind)} {shape}, "
-                f"is {tensor.dtype} {tensor.shape}; train the model again"
-            )
-        if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
-            raise InputError(f"{path}: tensor {name} holds NaN or infinity; train the model again")
         if name.endswith(".covariance") and not (np.linalg.eigvalsh(tensor) > 0).all():
             raise InputError(
                 f"{path}: tensor {name} must be positive definite; train the model again"

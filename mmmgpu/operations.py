@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mmmgpu.arrays import F32, as_batch, as_float32, broadcast_leads
+from mmmgpu.arrays import F32, I32, as_batch, as_float32, as_indices, broadcast_leads
 from mmmgpu.backends import Backend, get_backend
 from mmmgpu.errors import InputError
 
@@ -202,5 +202,46 @@ def evaluate_rbf(
     return k.to_host(k.evaluate_rbf(at, places, shares, plane, sharpness)).reshape(p.shape)
 
 
-def _on_device(backend: Backend, *arrays: F32) -> list[Any]:
+def piecewise_warp(
+    field: ArrayLike,
+    vertices: ArrayLike,
+    triangles: ArrayLike,
+    index: ArrayLike,
+    barycentric: ArrayLike,
+    *,
+    backend: str = "warp",
+) -> F32:
+    """Read `field` at the pixels of a mesh whose vertices have moved: piecewise-affine warp.
+
+        warped[p] = field(sum_j barycentric[p, j] vertices[triangles[index[p], j]])
+
+    bilinear, the border clamped. In which triangle a pixel lies, and where in it, is computed once
+    for a mesh (`mmmgpu.meshes`); from picture to picture only the vertices change.
+
+    Args:
+        field: Values of any unit, shape (batch..., H, W, C).
+        vertices: (x, y) [px] of the mesh's vertices in `field`, shape (batch..., N, 2).
+        triangles: Vertices of each triangle, whole numbers below N, shape (K, 3).
+        index: Triangle of each pixel, whole numbers below K, shape (P,).
+        barycentric: Barycentric coordinates of each pixel in its triangle [1], shape (P, 3).
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The values read, shape (batch..., P, C).
+    """
+    f = as_float32("field", field, *FIELD)
+    v = as_float32("vertices", vertices, "...", "N", 2)
+    t = as_indices("triangles", triangles, v.shape[-2], "K", 3)
+    i = as_indices("index", index, len(t), "P")
+    b = as_float32("barycentric", barycentric, len(i), 3)
+    lead = broadcast_leads(field=f.shape[:-3], vertices=v.shape[:-2])
+    shape = (*lead, len(i), f.shape[-1])
+    if not math.prod(shape) * f.size:
+        return np.zeros(shape, np.float32)
+    k = get_backend(backend)
+    given = _on_device(k, as_batch(f, lead, 3), as_batch(v, lead, 2), t, i, b)
+    return k.to_host(k.piecewise_warp(*given)).reshape(shape)
+
+
+def _on_device(backend: Backend, *arrays: F32 | I32) -> list[Any]:
     return [backend.to_device(a) for a in arrays]

@@ -4,6 +4,7 @@ import signal
 import hypothesis
 import psycopg
 import pytest
+from drawn_aams import make_drawn_aam
 from outside import missing, running_chromium
 from pairs import make_two_persons
 from postgres import find_programs, running
@@ -52,6 +53,12 @@ def world(tmp_path_factory):
 def two_persons(world, tmp_path_factory):
     """The person of `world` with a model, and another one with two clips; see `pairs`."""
     return make_two_persons(world, tmp_path_factory.mktemp("second"))
+
+
+@pytest.fixture(scope="session")
+def drawn(world):
+    """The person of `world` with landmarks and an appearance model; see `drawn_aams`."""
+    return make_drawn_aam(world)
 
 
 @pytest.fixture(scope="session")

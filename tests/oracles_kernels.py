@@ -80,6 +80,18 @@ def sample(field, points):
     return np.array(samples)
 
 
+def piecewise_warp(field, vertices, triangles, index, barycentric):
+    """Values (P, C) of one field at the pixels of a mesh, corner after corner."""
+    places = []
+    for triangle, shares in zip(index, barycentric, strict=True):
+        place = [0.0, 0.0]
+        for vertex, share in zip(triangles[triangle], shares, strict=True):
+            for axis in range(2):
+                place[axis] += float(share) * float(vertices[vertex, axis])
+        places.append(place)
+    return sample(field, np.array(places))
+
+
 def evaluate_rbf(points, centres, weights, affine, sharpness):
     """Images (P, 2) of points (P, 2): term by term."""
     mapped = []

@@ -2,13 +2,26 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mmmgpu.arrays import as_batch, as_float32
+from mmmgpu.arrays import as_batch, as_float32, as_indices
 from mmmgpu.errors import InputError
 
 
 def test_float32_arrays_are_not_copied():
     array = np.ones((2, 3), np.float32)
     assert as_float32("a", array, "N", 3) is array
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.int64, np.uint8, np.float64])
+def test_indices_of_any_type_become_int32(kind):
+    indices = as_indices("a", np.array([[0, 3]], kind), 4, "N", 2)
+    assert indices.dtype == np.int32
+    assert_array_equal(indices, [[0, 3]])
+
+
+@pytest.mark.parametrize("bad", [4, -1, 0.5])
+def test_indices_out_of_range_are_an_error_that_shows_one(bad):
+    with pytest.raises(InputError, match=rf"^a must hold whole numbers from 0 to 3, got {bad}"):
+        as_indices("a", [0, 3, bad, 1], 4, "N")
 
 
 @pytest.mark.parametrize(

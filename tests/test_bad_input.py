@@ -23,8 +23,9 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from mmmgpu import aligner, reconstruction, training
-from mmmgpu.model_files import HEADER, VERSION, load
+from mmmgpu.model_files import VERSION, load
 from mmmgpu.sounds import write_wav
+from mmmgpu.tensor_files import HEADER
 from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
 

@@ -12,6 +12,11 @@ from mmmgpu.errors import InputError
 ONES = np.ones((2, 4, 5, 3), np.float32)
 FLOW = np.zeros((2, 4, 5, 2), np.float32)
 POINTS = np.ones((2, 7, 2), np.float32)
+MESH = {
+    "triangles": np.array([[0, 1, 2], [2, 3, 6]], np.int32),
+    "index": np.array([0, 1, 1, 0, 1], np.int32),
+    "barycentric": np.full((5, 3), 1 / 3, np.float32),
+}
 
 CALLS = {
     "forward_warp": {"field": ONES, "flow": FLOW},
@@ -25,9 +30,12 @@ CALLS = {
         "weights": POINTS[1],
         "affine": ONES[0, :2, 0],
     },
+    "piecewise_warp": {"field": ONES, "vertices": POINTS, **MESH},
 }
 SCALARS = {"evaluate_rbf": {"sharpness": 0.1}}
 ARGUMENTS = [(name, argument) for name, call in CALLS.items() for argument in call]
+WHOLE = {"triangles": 7, "index": 2}  # numbers, and what they are below
+REAL = [(name, argument) for name, argument in ARGUMENTS if argument not in WHOLE]
 
 
 def call(name, backend="numpy", **changed):
@@ -39,13 +47,23 @@ def first(result):
     return result[0] if isinstance(result, tuple) else result
 
 
-@pytest.mark.parametrize(("name", "argument"), ARGUMENTS)
+@pytest.mark.parametrize(("name", "argument"), REAL)
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e39])
 def test_values_that_are_not_finite_name_the_argument(name, argument, bad):
     spoilt = CALLS[name][argument].astype(np.float64)
     spoilt.flat[-1] = bad
     with pytest.raises(InputError, match=rf"^{argument} holds NaN or infinite values"):
         call(name, **{argument: spoilt})
+
+
+@pytest.mark.parametrize("argument", WHOLE)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1, 0.5, None, 1e39])
+def test_whole_numbers_out_of_range_name_the_argument(argument, bad):
+    spoilt = MESH[argument].astype(np.float64)
+    spoilt.flat[-1] = WHOLE[argument] if bad is None else bad
+    says = "must hold whole numbers from 0 to" if np.isfinite(spoilt).all() else "holds NaN"
+    with pytest.raises(InputError, match=rf"^{argument} {says}"):
+        call("piecewise_warp", **{argument: spoilt})
 
 
 @pytest.mark.parametrize(("name", "argument"), ARGUMENTS)
@@ -92,6 +110,9 @@ def test_the_batch_axes_may_have_any_shape(backend, lead):
     sampled = operations.sample(field, flow, backend=backend)
     blended = operations.blend(np.ones((6, 4, 5, 3)), weights, backend=backend)
     mapped = call("evaluate_rbf", backend, points=flow)
+    vertices = flow.reshape(*lead, 20, 2)
+    read = call("piecewise_warp", backend, field=field, vertices=vertices)
+    assert read.shape == (*lead, 5, 3)
     assert mapped.shape == flow.shape
     assert warped.shape == filled.shape == sampled.shape == blended.shape == field.shape
     assert weight.shape == field.shape[:-1]
@@ -103,6 +124,8 @@ def test_the_batch_axes_may_have_any_shape(backend, lead):
             sampled[index], operations.sample(field[index], flow[index], backend=backend)
         )
         assert_array_equal(mapped[index], call("evaluate_rbf", backend, points=flow[index]))
+        one = call("piecewise_warp", backend, field=field[index], vertices=vertices[index])
+        assert_array_equal(read[index], one)
 
 
 def test_batch_axes_broadcast(backend):

@@ -95,6 +95,25 @@ def test_the_reference_blends_samples_and_scans_as_the_loops_do():
     )
 
 
+def mesh(rng, points, pixels):
+    """Triangles, and pixels in them: also at corners, and outside by a little."""
+    triangles = rng.integers(0, points, (7, 3))
+    barycentric = rng.dirichlet(np.ones(3), pixels).astype(np.float32)
+    barycentric[: pixels // 3] = np.eye(3)[rng.integers(0, 3, pixels // 3)]
+    barycentric[-1] = (1.2, -0.1, -0.1)
+    return triangles, rng.integers(0, 7, pixels), barycentric
+
+
+def test_the_reference_warps_meshes_as_the_loops_do():
+    rng = np.random.default_rng(0)
+    field = rng.normal(0, 1, (2, 5, 4, 3)).astype(np.float32)
+    vertices = rng.uniform(-2, 7, (2, 6, 2)).astype(np.float32)
+    given = mesh(rng, 6, 20)
+    warped = operations.piecewise_warp(field, vertices, *given, backend="numpy")
+    for b in range(2):
+        assert_close(warped[b], oracles.piecewise_warp(field[b], vertices[b], *given))
+
+
 @pytest.mark.parametrize("sharpness", [0, 0.03, 5])
 def test_the_reference_evaluates_gaussians_as_the_loops_do(sharpness):
     rng = np.random.default_rng(0)
@@ -170,6 +189,28 @@ def test_sample(backend, flow, size, channels):
     points = grid(*size) + flows
     actual = operations.sample(field, points, backend=backend)
     assert_close(actual, operations.sample(field, points, backend="numpy"))
+
+
+@pytest.mark.parametrize("channels", range(1, 9))
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("far", [0, 3, 1e6, 1e38])
+def test_piecewise_warp(backend, far, size, channels):
+    rng = np.random.default_rng(channels)
+    field = rng.normal(0, 1, (3, *size, channels))
+    vertices = rng.uniform(0, size[::-1], (3, 9, 2)) + far * rng.normal(0, 1, (3, 9, 2)).clip(-1, 1)
+    given = field, vertices, *mesh(rng, 9, 50)
+    actual = operations.piecewise_warp(*given, backend=backend)
+    assert_close(actual, operations.piecewise_warp(*given, backend="numpy"))
+
+
+@pytest.mark.parametrize(("fields", "sets"), [(1, 4), (4, 1)])
+def test_piecewise_warp_of_a_large_picture(backend, fields, sets):
+    rng = np.random.default_rng(0)
+    field = rng.random((fields, *LARGE, 3), dtype=np.float32)
+    vertices = rng.uniform(0, LARGE[::-1], (sets, 40, 2))
+    given = field, vertices, *mesh(rng, 40, 5000)
+    actual = operations.piecewise_warp(*given, backend=backend)
+    assert_close(actual, operations.piecewise_warp(*given, backend="numpy"))
 
 
 @pytest.mark.parametrize("channels", range(1, 9))

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mmmgpu.aam import fit_aam
+from mmmgpu.aam_evaluation import evaluate_aam
 from mmmgpu.adaptation import adapt
 from mmmgpu.alignments import find_alignment, frame_labels, read_alignment
 from mmmgpu.evaluation import evaluate, measure_reconstruction
@@ -164,3 +166,13 @@ def test_a_moving_head_through_the_command_line(tmp_path):
     model = load(out)
     assert model.notes["unregistered_frames"] < 25
     assert model.notes["registration_residual_px"] < 1.5
+
+
+def test_an_appearance_model_shows_and_finds_held_out_faces():
+    every = clips("grid-s1")
+    training = [clip for i, clip in enumerate(every) if i % 12][::5]
+    aam = fit_aam(training, every[0].parent, frames=400)
+    found = evaluate_aam(aam, every[12::84], every[0].parent)
+    assert len(aam.variance) == 32
+    assert found["psnr_db"]["mean"] >= 32
+    assert found["converged"] >= 0.95

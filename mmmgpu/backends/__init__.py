@@ -82,6 +82,11 @@ class Backend(Protocol):
         A prototype costs nothing where its weight is 0; else as `move_prototypes`.
         """
 
+    def piecewise_warp(
+        self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any, /
+    ) -> Any:
+        """(B, H, W, C), (B, N, 2), (K, 3), (P,), (P, 3) -> (B, P, C); whole numbers are int32."""
+
 
 def list_devices(family: str) -> dict[str, str]:
     """Names for `get_backend` with what they stand for, of one of `BACKENDS`.

@@ -226,6 +226,19 @@ class Launches(ABC):
         check_some_valid(self.to_host(arrived))
         return mixed
 
+    def piecewise_warp(
+        self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any
+    ) -> Any:
+        fields, height, width, channels = field.shape
+        sets, points, _ = vertices.shape
+        number = index.shape[0]
+        batch = max(fields, sets)
+        warped = self.empty(batch, number, channels)
+        sizes = [fields, sets, points, number, height, width, channels]
+        inputs = [field, vertices, triangles, index, barycentric, *sizes]
+        self.launch_all("piecewise_warp.piecewise_warp", batch * number, inputs, [warped])
+        return warped
+
     def _coarser(self, level: Level) -> Level:
         """An uninitialised level of half the size; its weights are numbers of valid pixels."""
         batch, height, width, channels = level.value.shape

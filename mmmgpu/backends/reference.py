@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.arrays import F32, check_some_valid
+from mmmgpu.arrays import F32, I32, check_some_valid
 from mmmgpu.errors import InputError
-
-I32 = NDArray[np.int32]
 
 FAR = 1e8  # [px] beyond any picture, inside int32
 
@@ -113,6 +111,15 @@ class Reference:
     def _filled_warp(self, field: F32, flow: F32, hole: float) -> F32:
         return self.fill_holes(*self.forward_warp(field, flow), hole)
 
+    def piecewise_warp(
+        self, field: F32, vertices: F32, triangles: I32, index: I32, barycentric: F32
+    ) -> F32:
+        corners = vertices[:, triangles[index]].astype(np.float64)  # (sets, P, 3, 2)
+        points = (barycentric[..., None] * corners).sum(axis=-2)
+        batch = max(len(field), len(points))
+        gathered = [_gather(field[b % len(field)], points[b % len(points)]) for b in range(batch)]
+        return np.stack(gathered)
+
 
 def _splat(field: F32, flow: F32) -> tuple[F32, F32]:
     """Forward warp of one field (H, W, C) along one flow (H, W, 2)."""
@@ -189,7 +196,7 @@ def _double(level: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.fl
     return level
 
 
-def _gather(field: F32, points: F32) -> F32:
+def _gather(field: F32, points: NDArray[np.floating]) -> F32:
     """Bilinear samples (..., C) of one field (H, W, C) at points (..., 2)."""
     height, width, _ = field.shape
     limit = np.array([width - 1, height - 1], np.float32)

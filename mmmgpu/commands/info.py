@@ -12,7 +12,13 @@ import typer
 from mmmgpu import __version__
 from mmmgpu.commands.options import Json
 from mmmgpu.commands.places import require_output, write_results
-from mmmgpu.commands.summaries import model_facts, show_model, show_table
+from mmmgpu.commands.summaries import (
+    aam_facts,
+    model_facts,
+    show_aam,
+    show_model,
+    show_table,
+)
 
 EXAMPLE = "Examples: mmmgpu info; mmmgpu info ann.mmm --json ann.json"
 REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^]]*\])?[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
@@ -20,7 +26,8 @@ REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^]]*\])?[^;]*(?:;.*extra == ['\"](\w+)
 
 def info(
     model: Annotated[
-        Path | None, typer.Argument(metavar="MODEL", help="A model; without one: this machine.")
+        Path | None,
+        typer.Argument(metavar="MODEL", help="A model of either kind; without one: this machine."),
     ] = None,
     *,
     json: Json = None,
@@ -34,12 +41,22 @@ def info(
         facts = machine_facts()
         show_machine(facts)
     else:
-        from mmmgpu.model_files import load
-
-        person = load(model)
-        facts = model_facts(person, model)
-        show_model(person, model)
+        facts = show_file(model)
     write_results(facts, json)
+
+
+def show_file(path: Path) -> dict[str, Any]:
+    """Print what a model of either kind holds; the same as JSON values."""
+    from mmmgpu import aam_files, model_files
+    from mmmgpu.tensor_files import format_of
+
+    if format_of(path) == aam_files.KIND.format:
+        appearance = aam_files.load_aam(path)
+        show_aam(appearance, path)
+        return aam_facts(appearance, path)
+    person = model_files.load(path)
+    show_model(person, path)
+    return model_facts(person, path)
 
 
 def machine_facts() -> dict[str, Any]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mmmgpu.appearances import Aam
     from mmmgpu.models import Model
     from mmmgpu.trajectory_training import TrainedStream
 
@@ -95,6 +96,45 @@ def show_model(model: "Model", path: Path) -> None:
         rows.append((f"{name} training", f"{said}; error {100 * gain:.1f} % below pooled"))
     rows.append(("trajectories", ", ".join(facts["trajectories"])))
     rows += [(key.replace("_", " "), _said(value)) for key, value in model.notes.items()]
+    show_table(str(path), rows)
+
+
+def aam_facts(aam: "Aam", path: Path) -> dict[str, Any]:
+    """All that `aam`, read from `path`, holds beside pictures: JSON values."""
+    from mmmgpu.aam_files import KIND
+
+    height, width = aam.mesh.shape
+    return {
+        "aam": str(path),
+        "format_version": KIND.version,
+        "parameters": len(aam.variance),
+        "variance_share": aam.share,
+        "points": len(aam.mesh.vertices),
+        "landmark_rows": None if aam.rows is None else list(aam.rows),
+        "triangles": len(aam.mesh.triangles),
+        "pixels": len(aam.mesh.pixels.index),
+        "mean_shape_size": [width, height],
+        "reduction": aam.reduction,
+        "shape_modes": len(aam.shape_variance),
+        "texture_modes": len(aam.texture_variance),
+        "variance_of_parameters": aam.variance.tolist(),
+        "notes": aam.notes,
+    }
+
+
+def show_aam(aam: "Aam", path: Path) -> None:
+    """Print the main facts about `aam`."""
+    facts = aam_facts(aam, path)
+    width, height = facts["mean_shape_size"]
+    share = 100 * facts["variance_share"]
+    rows = [
+        ("parameters", f"{facts['parameters']}, with {share:.1f} % of the variance"),
+        ("points", f"{facts['points']}, in {facts['triangles']} triangles"),
+        ("mean shape", f"{facts['pixels']} pixels in {width} x {height}"),
+        ("frames reduced by", str(facts["reduction"])),
+        ("fitted by", f"{facts['shape_modes']} shape modes"),
+    ]
+    rows += [(key.replace("_", " "), _said(value)) for key, value in aam.notes.items()]
     show_table(str(path), rows)
 
 
