@@ -43,6 +43,7 @@ from mmmgpu.phonemes import positive
 
 NOISE_FLOOR = 1e-6  # of the variance of all frames: the least that R may be
 FIRST_A = 0.7  # where the descent starts
+TOLERANCE = 2e-6  # the descent ends where an iteration gains less, as a share of the objective
 BATCH_FRAMES = 50_000
 
 
@@ -110,7 +111,7 @@ def descend(data: Labelled, *, iterations: int = 100) -> Dpds:
         jac=True,
         method="L-BFGS-B",
         bounds=[(-LARGEST_A, LARGEST_A)] * (P * d),
-        options={"maxiter": iterations, "ftol": 1e-7},
+        options={"maxiter": iterations, "ftol": TOLERANCE},
     )
     A = found.x.reshape(P, d)
     return _completed(data, profile(A, parts)[2], parts, floor)
