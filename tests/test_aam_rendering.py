@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -56,6 +57,27 @@ def test_a_face_takes_on_what_another_frame_shows(drawn, world):
     made = render_face(drawn.aam, closed, at_closed, c, WARP, where="x")
     near = mouth_hull(at_opened[5:], closed.shape)
     assert psnr(made, opened, near) > psnr(closed, opened, near) + 5
+
+
+def hull(points, shape):
+    """Pixels of a picture inside the convex hull of points (N, 2)."""
+    inside = np.zeros(shape[:2], np.uint8)
+    outline = cv2.convexHull(points.astype(np.float32))[:, 0]
+    cv2.fillConvexPoly(inside, np.rint(outline).astype(np.int32), 1)
+    return inside > 0
+
+
+def test_what_lies_around_the_jaw_moves_along(drawn, world):
+    """A closed mouth in place of an open one: below the chin is neck, not the old chin."""
+    motion = hold(POSTURES[0], POSTURES[2])
+    closed, opened = render(world.face, motion)
+    rows = list(drawn.aam.rows)
+    at_closed, at_opened = (landmarks(world.face, motion, t)[rows] for t in (0, 1))
+    c = own_features(drawn, closed, at_closed)
+    made = render_face(drawn.aam, opened, at_opened, c, WARP, where="x")
+    below = hull(at_opened, closed.shape) & ~hull(at_closed, closed.shape)
+    assert below.sum() > 40
+    assert psnr(made, closed, below) > psnr(opened, closed, below) + 3
 
 
 def test_the_frame_is_not_changed(drawn):
