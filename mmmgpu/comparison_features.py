@@ -22,7 +22,6 @@ from mmmgpu.reconstruction import Analysed, analyse_clip, reconstructed_frames
 from mmmgpu.sounds import read_sound
 from mmmgpu.training import Options, train
 from mmmgpu.video_writing import write_video
-from mmmgpu.videos import read_frames
 
 Picture = NDArray[np.uint8]
 
@@ -108,7 +107,7 @@ class AamFeatures:
 
     def learn(self, clips: Sequence[Clip], folder: Path, fold: int) -> Eye:
         """An AAM of the clips."""
-        from mmmgpu.aam import fit_aam  # type: ignore[import-not-found,unused-ignore]
+        from mmmgpu.aam import fit_aam
 
         aam = fit_aam([clip.path for clip in clips], self.landmarks, backend=self.backend)
         return _AamEye(aam, self.landmarks, self.backend)
@@ -121,27 +120,15 @@ class _AamEye:
     backend: str
 
     def features(self, clip: Clip) -> Floats:
-        from mmmgpu.aam import features  # type: ignore[import-not-found,unused-ignore]
+        from mmmgpu.aam import features
 
         return np.asarray(features(self.aam, clip.path, self.landmarks, backend=self.backend))
 
     def render(self, clip: Clip, features: Floats, out: Path) -> None:
-        _write(clip, out, self._frames(clip, features))
+        from mmmgpu.aam import reconstruct
 
-    def _frames(self, clip: Clip, features: Floats) -> Iterator[Picture]:
-        from mmmgpu.aam import complete_clip  # type: ignore[import-not-found,unused-ignore]
-        from mmmgpu.aam_rendering import (  # type: ignore[import-not-found,unused-ignore]
-            render_face,
-        )
-        from mmmgpu.backends import get_backend
-
-        kernels = get_backend(self.backend, 1)
-        points = complete_clip(self.aam, clip.path, self.landmarks).points
-        for t, (frame, own, c) in enumerate(
-            zip(read_frames(clip.path), points, features, strict=True)
-        ):
-            where = f"{clip.path}: frame {t}"
-            yield render_face(self.aam, frame, own, c, kernels, where=where)
+        frames = reconstruct(self.aam, features, clip.path, self.landmarks, backend=self.backend)
+        _write(clip, out, frames)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ Source: Englebienne, Cootes & Rattray (NIPS 2007).
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,16 +25,14 @@ from numpy.typing import ArrayLike
 from mmmgpu.brand import Brand
 from mmmgpu.dpds import Dpds
 from mmmgpu.errors import InputError
-from mmmgpu.files import write_bytes
 from mmmgpu.flat_records import record_of, tensors_of
 from mmmgpu.hmm_mean import HmmMean
 from mmmgpu.labelled import Floats
 from mmmgpu.regularised import Regularised
 from mmmgpu.slds import Slds
+from mmmgpu.tensor_files import Facts, FileKind, Tensors, read_tensors, write_tensors
 
-HEADER = "mmmgpu"
-FORMAT = "mmmgpu-dynamics"
-VERSION = 1
+KIND = FileKind("mmmgpu-dynamics", 1, "model of movement", "save_dynamics", "fit the model again")
 
 
 class Dynamics(Protocol):
@@ -100,11 +97,7 @@ def trajectory(model: Dynamics, labels: Sequence[str]) -> Floats:
 
 def save_dynamics(model: Dynamics, path: str | os.PathLike[str]) -> None:
     """Write `model` to one safetensors file, whole or not at all."""
-    from safetensors.numpy import save
-
-    facts = {"format": FORMAT, "version": VERSION, **facts_of(model)}
-    tensors = {n: np.ascontiguousarray(a) for n, a in tensors_of(model).items()}
-    write_bytes(path, save(tensors, metadata={HEADER: json.dumps(facts, ensure_ascii=False)}))
+    write_tensors(path, KIND, facts_of(model), tensors_of(model))
 
 
 def load_dynamics(path: str | os.PathLike[str]) -> Dynamics:
@@ -114,37 +107,14 @@ def load_dynamics(path: str | os.PathLike[str]) -> Dynamics:
         InputError: No such file, not such a model, truncated, of a newer version, or with tensors
             that are missing, misshapen, not finite, or not what the model needs.
     """
-    from safetensors import SafetensorError, safe_open
+    return read_tensors(path, KIND, _checked)
 
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give one that save_dynamics has written")
-    try:
-        with safe_open(str(path), framework="numpy") as file:
-            facts = _read_header(path, (file.metadata() or {}).get(HEADER, "null"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as e:
-        raise InputError(f"{path}: truncated, damaged or not a model ({e}); fit it again") from e
+
+def _checked(path: Path, tensors: Tensors, facts: Facts) -> Dynamics:
     try:
         return model_of(facts, tensors)
     except InputError as e:
-        raise InputError(f"{path}: {e}; fit the model again") from e
-
-
-def _read_header(path: Path, text: str) -> dict[str, Any]:
-    try:
-        facts = json.loads(text)
-    except json.JSONDecodeError:
-        facts = None
-    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise InputError(f"{path}: not a model of movement; give a file of save_dynamics")
-    version = facts.get("version")
-    if type(version) is not int or not 1 <= version <= VERSION:
-        raise InputError(
-            f"{path}: has format version {version}, this mmmgpu reads up to {VERSION}; "
-            "update mmmgpu"
-        )
-    return facts
+        raise InputError(f"{path}: {e}; {KIND.remedy}") from e
 
 
 def facts_of(model: Dynamics) -> dict[str, Any]:

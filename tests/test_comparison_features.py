@@ -1,10 +1,9 @@
-import sys
-from types import ModuleType, SimpleNamespace
-
 import numpy as np
 import pytest
 from commands import SMALL, trained_model
+from pairs import write_landmarks
 
+from mmmgpu.aam import features
 from mmmgpu.comparison_features import (
     AamFeatures,
     MmmFeatures,
@@ -100,36 +99,21 @@ def test_a_morphable_model_is_trained_on_the_folds_clips_and_shows_others(
     assert source.facts() != MmmFeatures(world.alignments, "warp").facts()
 
 
-def test_an_appearance_model_is_asked_for_features_and_faces(clips, tmp_path, monkeypatch):
-    """The interface that is relied on, with a model that paints frames with its features."""
-    asked = []
-
-    def fit_aam(paths, landmarks, *, backend):
-        asked.append((list(paths), landmarks, backend))
-        return "the model"
-
-    def features(aam, path, landmarks, *, backend):
-        assert (aam, landmarks, backend) == ("the model", tmp_path, "numpy")
-        return np.full((probe(path).frames, 1), 200.0)
-
-    def complete_clip(aam, path, landmarks):
-        return SimpleNamespace(points=np.zeros((probe(path).frames, 3, 2)))
-
-    def render_face(aam, frame, points, c, kernels, *, where):
-        assert points.shape == (3, 2)
-        assert where.startswith(f"{clips[2].path}: frame ")
-        return np.full_like(frame, c[0])
-
-    door = {"fit_aam": fit_aam, "features": features, "complete_clip": complete_clip}
-    for name, what in (("aam", door), ("aam_rendering", {"render_face": render_face})):
-        module = ModuleType(name)
-        vars(module).update(what)
-        monkeypatch.setitem(sys.modules, f"mmmgpu.{name}", module)
-    eye = AamFeatures(tmp_path, "numpy").learn(clips[:2], tmp_path, 0)
-    assert asked == [([clip.path for clip in clips[:2]], tmp_path, "numpy")]
+def test_features_of_an_appearance_model_are_shown_as_faces(world, clips, tmp_path):
+    write_landmarks(world)
+    source = AamFeatures(world.alignments, "warp")
+    eye = source.learn(clips[:2], tmp_path, 0)
     y = eye.features(clips[2])
-    eye.render(clips[2], y, tmp_path / "a.mp4")
-    frames = list(read_frames(tmp_path / "a.mp4"))
-    assert len(frames) == clips[2].info.frames
-    assert np.abs(np.array(frames, np.float32) - 200).max() < 6
-    assert probe(tmp_path / "a.mp4").has_sound
+    assert y.shape == (clips[2].info.frames, 32)
+    np.testing.assert_array_equal(y, features(eye.aam, clips[2].path, world.alignments))
+    eye.render(clips[2], y, tmp_path / "reality.mp4")
+    eye.render(clips[2], np.zeros_like(y), tmp_path / "still.mp4")
+    info = probe(tmp_path / "reality.mp4")
+    assert (info.frames, info.has_sound) == (clips[2].info.frames, True)
+    shown, still, real = (
+        np.array(list(read_frames(name)), np.float32)
+        for name in (tmp_path / "reality.mp4", tmp_path / "still.mp4", clips[2].path)
+    )
+    moved = np.abs(shown - still) > 8
+    assert moved.mean() > 0.001
+    assert np.abs(shown - real)[moved].mean() < 0.5 * np.abs(still - real)[moved].mean()
