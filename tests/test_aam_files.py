@@ -28,6 +28,7 @@ def assert_same(a, b):
         else:
             assert_array_equal(x, y)
             assert np.asarray(x).dtype == np.asarray(y).dtype, f.name
+            assert type(x) is type(y), f.name
 
 
 def test_a_model_comes_back_bit_for_bit(drawn, tmp_path):
