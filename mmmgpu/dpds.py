@@ -97,13 +97,13 @@ def descend(data: Labelled, *, iterations: int = 100) -> Dpds:
 
     P, d, n = len(data.labels), data.y[0].shape[1], len(data.frames)
     parts = batches(data, frames=BATCH_FRAMES)
-    floor = NOISE_FLOOR * positive(data.frames.var(axis=0))
+    variance = positive(data.frames.var(axis=0))
 
     def objective(flat: Floats) -> tuple[float, Floats]:
         """-log p(y) / N [nats a frame] at the best R for this A, up to a constant."""
         error, slope, _ = profile(flat.reshape(P, d), parts)
-        share = error / n + floor
-        return float(0.5 * np.log(share).sum()), (0.5 / n * slope / share).ravel()
+        share = error / (n * variance) + NOISE_FLOOR  # without unit, as `TOLERANCE` should be
+        return float(0.5 * np.log(share).sum()), (0.5 / (n * variance) * slope / share).ravel()
 
     found = minimize(
         objective,
@@ -114,7 +114,7 @@ def descend(data: Labelled, *, iterations: int = 100) -> Dpds:
         options={"maxiter": iterations, "ftol": TOLERANCE},
     )
     A = found.x.reshape(P, d)
-    return _completed(data, profile(A, parts)[2], parts, floor)
+    return _completed(data, profile(A, parts)[2], parts, NOISE_FLOOR * variance)
 
 
 def _completed(data: Labelled, best: Parameters, parts: Sequence[Batch], floor: Floats) -> Dpds:
