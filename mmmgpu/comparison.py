@@ -79,10 +79,11 @@ def compare(
         sentence that a fold learned from, with what took their place.
 
     Raises:
-        InputError: There are fewer clips than folds, or fewer than two folds; what cannot be used
-            is named by fold and sentence.
+        InputError: There are fewer clips than folds, or fewer than two folds; a video would replace
+            a clip; what cannot be used is named by fold and sentence.
     """
     folds = deal(len(corpus), options)
+    _keep_clips(corpus, videos)
     given = {**vars(options), "features": features.facts(), "videos": str(videos)}
     given["said"] = [clip.labels for clip in corpus]
     folder = open_checkpoints(work, fingerprint([clip.path for clip in corpus], given))
@@ -95,6 +96,22 @@ def compare(
     results = [_read(folder, f) for f in range(len(folds))]
     shutil.rmtree(folder)
     return _gathered(results)
+
+
+def _keep_clips(corpus: Sequence[Clip], videos: Path | None) -> None:
+    """Refuse videos that would replace what they are made from."""
+    if videos is None:
+        return
+    clips = {clip.path.resolve() for clip in corpus}
+    for condition in (*MODELS, REALITY):
+        for clip in corpus:
+            out = _video(videos, condition, clip.path.stem)
+            if out.resolve() in clips:
+                raise InputError(f"{out}: would replace a clip; choose another folder for videos")
+
+
+def _video(videos: Path, condition: str, sentence: str) -> Path:
+    return videos / condition / f"{sentence}.mp4"
 
 
 def deal(count: int, options: CompareOptions) -> list[list[int]]:
@@ -179,7 +196,8 @@ class _Fold:
 
     def _show(self, eye: Eye, condition: str, i: int, x: Floats) -> None:
         if self.videos is not None:
-            out = require_folder(self.videos / condition) / f"{self._name(i)}.mp4"
+            out = _video(self.videos, condition, self._name(i))
+            require_folder(out.parent)
             with self._named(f"{self._name(i)} by {condition}"):
                 eye.render(self.corpus[i], x, out)
 

@@ -35,7 +35,7 @@ def open_corpus(paths: Sequence[Path], alignments: Path, *, sync: float = 0.0) -
     """Look at every clip and its alignment.
 
     Args:
-        paths: Video files of one person, with different names, of one size.
+        paths: Video files of one person, with different names before the suffix, of one size.
         alignments: Folder with a TextGrid, .align or .lab for every clip, or one such file.
         sync: [s] by which sound and alignment are moved against the picture; negative: earlier.
 
@@ -44,7 +44,7 @@ def open_corpus(paths: Sequence[Path], alignments: Path, *, sync: float = 0.0) -
     """
     if not paths:
         raise InputError("no clip given; name at least one video file")
-    names = [path.name for path in paths]
+    names = [path.stem for path in paths]  # by which alignments and results are found
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
         raise InputError(f"{double[0]}: two clips have this name; rename one of them")

@@ -49,14 +49,14 @@ def read_errors(path: str | os.PathLike[str]) -> Errors:
 def _rows(path: Path) -> Iterable[Mapping[str, Any]]:
     try:
         text = path.read_text("utf-8-sig")
-        values = json.loads(text) if path.suffix.lower() == ".json" else None
+        if path.suffix.lower() != ".json":
+            return list(csv.DictReader(text.splitlines()))
+        values = json.loads(text)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, csv.Error) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: is no table of errors ({reason}); correct it") from error
-    if values is None:
-        return csv.DictReader(text.splitlines())
     try:
         return list(_compared(values["sentences"]))
     except (AttributeError, KeyError, TypeError) as error:

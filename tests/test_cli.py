@@ -23,7 +23,7 @@ from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
 
 COMMANDS = ("demo", "align", "train", "reconstruct", "speak", "evaluate")
-COMMANDS += ("mark", "transfer", "adapt", "compare", "info")
+COMMANDS += ("mark", "transfer", "adapt", "aam", "compare", "info")
 SLOW = {"av", "cv2", "matplotlib", "numpy", "rich", "scipy", "sklearn", "warp"}
 
 
@@ -40,7 +40,7 @@ def model(world):
 def test_help_names_every_command(mmmgpu):
     ended = mmmgpu("--help")
     assert ended.status == 0
-    assert all(f"\n  {name} " in ended.out for name in COMMANDS)
+    assert all(f"\n  {name} " in ended.out for name in (*COMMANDS, "study"))
     assert "..." not in ended.out.partition("Commands:")[2]  # no summary is cut
 
 

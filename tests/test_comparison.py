@@ -1,5 +1,5 @@
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -201,6 +201,25 @@ def test_videos_lie_by_condition_and_sentence(tmp_path, monkeypatch):
     assert found == {f"{c}/s{i}.mp4" for c in ("hmm", "dpds", REALITY) for i in (1, 4)}
     real = np.load(tmp_path / "videos" / REALITY / "s4.mp4")
     np.testing.assert_array_equal(real, np.load(tmp_path / "s4.npz")["features"])
+
+
+def test_videos_never_replace_the_clips(tmp_path):
+    folder = tmp_path / "videos" / REALITY
+    folder.mkdir(parents=True)
+    clips = corpus(folder)
+    own = folder / "s0.mp4"
+    clips[0].path.rename(own)
+    clips[0] = replace(clips[0], path=own)
+    with pytest.raises(InputError, match=r"reality/s0\.mp4: would replace a clip"):
+        compare(
+            clips,
+            SavedFeatures(folder),
+            tmp_path / "work",
+            videos=tmp_path / "videos",
+            options=CompareOptions(folds=2),
+        )
+    assert own.read_bytes() == b"s0"
+    assert not (tmp_path / "work").exists()
 
 
 def test_arithmetic_that_fails_is_said_too(tmp_path, monkeypatch):

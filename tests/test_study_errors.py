@@ -72,6 +72,9 @@ def test_a_table_that_is_not_text_or_not_there(tmp_path):
         read_errors(tmp_path / "e.csv")
     with pytest.raises(InputError, match="cannot be read"):
         read_errors(tmp_path / "nowhere.csv")
+    (tmp_path / "e.csv").write_text(TABLE + "a" * 200_000 + "\n")
+    with pytest.raises(InputError, match=r"e\.csv: is no table of errors \(field larger"):
+        read_errors(tmp_path / "e.csv")
 
 
 def test_a_table_of_something_else_is_refused(errors):

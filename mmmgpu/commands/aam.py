@@ -68,7 +68,7 @@ def aam(
     report: Report = None,
     json: Json = None,
 ) -> None:
-    """Learn how the shape and the look of a face vary, from CLIPs with landmarks.
+    """Learn how a face varies from CLIPs with landmarks.
 
     The model turns a frame into a few features and features into a picture (Cootes et al. 2001).
     Clips given with --test are not learned from, also where they are among CLIPs: how well the
