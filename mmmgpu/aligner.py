@@ -15,7 +15,6 @@ from mmmgpu.alignments import Alignment, Segment, cover
 from mmmgpu.errors import InputError
 from mmmgpu.phones import SIL, normalise_label
 from mmmgpu.pronunciation import dictionary, pronounce, spoken_words
-from mmmgpu.sounds import checked_speech, levelled
 
 MODEL_RATE: Final = 16_000  # Hz
 FRAME: Final = 0.01  # s, between frames of the acoustic model
@@ -74,6 +73,8 @@ def align_speech(samples: ArrayLike, rate: int, transcript: str) -> Alignment:
     Raises:
         InputError: No sound, no words, a transcript that does not fit, or no pocketsphinx.
     """
+    from mmmgpu.sounds import checked_speech, levelled
+
     sound = checked_speech(samples, rate)
     words = spoken_words(transcript)
     if not words:
