@@ -76,7 +76,7 @@ def _csv(results: Mapping[str, Any]) -> str:
 
 
 def _draw(results: Mapping[str, Any], path: Path) -> None:
-    """Means over folds as bars, 95 % intervals as whiskers, a panel a metric."""
+    """Means over folds as points, 95 % intervals as whiskers, a panel a metric."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

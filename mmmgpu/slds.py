@@ -7,7 +7,7 @@ explicit, so that A can be diagonal. As the labels are known, this is one linear
 sequence: exact EM with `mmmgpu.kalman`. What is generated is the most likely y, which is x without
 noise.
 
-Three things are ours. Q and R are at least a small share of the features' variance; A has no
+Three things are ours. Sigma, Q and R are at least a small share of the features' variance; A has no
 eigenvalue beyond `LARGEST_A`, without which a long phone overflows (both are constraints within the
 maximum that EM climbs to, so the likelihood never goes down); and a label that starts no sequence,
 or is never entered, takes mu, or A and Q, from what is known of all frames.
