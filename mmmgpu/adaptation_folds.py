@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mmmgpu.errors import InputError
-from mmmgpu.gdlr import DESCENT, RATES, RULES, UNITS, Descent, descend_means
+from mmmgpu.gdlr import DESCENT, RULES, Descent, descend_means
 from mmmgpu.linear_adaptation import map_means, regress_means
 from mmmgpu.phonemes import PhonemeModels, Utterance, cut_utterance
 from mmmgpu.phones import stand_in
@@ -117,13 +117,14 @@ def _mllr(models: PhonemeModels, class_of: Rows, part: _Part, _: Descent) -> lis
 
 
 def _gdlr(models: PhonemeModels, class_of: Rows, part: _Part, descent: Descent) -> list[Candidate]:
-    m, s = UNITS[descent.rule](models)
+    rule = RULES[descent.rule]
+    m, s = rule.units(models)
     mean, z = (models.mean - m) / s, (part.z - m) / s
-    steps = RULES[descent.rule](part.system, mean, class_of)
+    steps = rule.steps(part.system, mean, class_of)
     descend = partial(descend_means, part.system, mean, z, class_of)
     return [
         ({"rule": descent.rule, "rate": rate, "iterations": i}, m + s * moved)
-        for rate in descent.rates or RATES[descent.rule]
+        for rate in descent.rates or rule.rates
         for i, moved in enumerate(descend(steps=rate * steps, iterations=descent.iterations))
     ]
 

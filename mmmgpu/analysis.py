@@ -254,16 +254,6 @@ def _fit_beta(analyzer: Analyzer, image: F32, warped: F32, used: NDArray[np.int6
     return beta
 
 
-def fit_mixture(warped: F32, image: F32, pixels: NDArray[np.int64], weight: F32) -> Floats:
-    """The weights (n,) on the simplex with which pictures mix to `image` best.
-
-    warped: (n, h w, 3). image: (h, w, 3). pixels, weight: those that count, and sqrt(w_t) there.
-    """
-    a = (warped[:, pixels] * weight[:, None]).reshape(len(warped), -1)
-    b = (image.reshape(-1, 3)[pixels] * weight[:, None]).ravel()
-    return solve_simplex(a @ a.T, a @ b)
-
-
 def solve_simplex(gram: F32, right: F32) -> Floats:
     """min_b b' G b / 2 - h' b with b >= 0, sum b = 1; G (n, n), h (n,) -> b (n,)."""
     n = len(right)

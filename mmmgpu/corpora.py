@@ -42,16 +42,24 @@ def open_corpus(paths: Sequence[Path], alignments: Path, *, sync: float = 0.0) -
     Raises:
         InputError: Of the first file that cannot be used.
     """
-    if not paths:
-        raise InputError("no clip given; name at least one video file")
-    names = [path.stem for path in paths]  # by which alignments and results are found
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise InputError(f"{double[0]}: two clips have this name; rename one of them")
+    check_names(paths)
     corpus = [_open_clip(path, alignments, sync) for path in paths]
     for clip in corpus[1:]:
         _check_size(corpus[0].info, clip.info)
     return corpus
+
+
+def check_names(clips: Sequence[Path]) -> None:
+    """Raise InputError unless there are clips, with different names before the suffix.
+
+    By these what belongs to a clip is found: alignments, landmarks, results.
+    """
+    if not clips:
+        raise InputError("no clip given; name at least one video file")
+    names = [clip.stem for clip in clips]
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise InputError(f"{double[0]}: two clips have this name; rename one of them")
 
 
 def _check_size(first: VideoInfo, other: VideoInfo) -> None:

@@ -74,13 +74,28 @@ def paper_units(models: PhonemeModels) -> tuple[Array, float]:
     return np.zeros(models.mean.shape[1]), 1.0
 
 
-RULES: Final[MappingProxyType[str, Callable[[System, Array, Rows], Array]]] = MappingProxyType(
-    {"bounded": bounded_steps, "paper": paper_steps}
+@dataclass(frozen=True)
+class Rule:
+    """How steps are taken.
+
+    Attributes:
+        steps: of each class and dimension, (G, d), before the rate; given a system, the means in
+            these units, (P, d), and the class of each phone.
+        units: (m, s) of the coordinates (mu - m)/s that are descended in.
+        rates: to choose from where none are given.
+    """
+
+    steps: Callable[[System, Array, Rows], Array]
+    units: Callable[[PhonemeModels], tuple[Array, float]]
+    rates: tuple[float, ...]
+
+
+RULES: Final = MappingProxyType(
+    {
+        "bounded": Rule(bounded_steps, standard_units, (0.1, 0.3, 1.0)),
+        "paper": Rule(paper_steps, paper_units, (0.005,)),
+    }
 )
-UNITS: Final[MappingProxyType[str, Callable[[PhonemeModels], tuple[Array, float]]]] = (
-    MappingProxyType({"bounded": standard_units, "paper": paper_units})
-)
-RATES: Final = MappingProxyType({"bounded": (0.1, 0.3, 1.0), "paper": (0.005,)})
 
 
 @dataclass(frozen=True)
@@ -89,7 +104,7 @@ class Descent:
 
     Attributes:
         rule: "bounded": steps by the curvature. "paper": one eta for all.
-        rates: eta' in (0, 1], or the paper's eta > 0, to choose from. Empty: `RATES` of the rule.
+        rates: eta' in (0, 1], or the paper's eta > 0, to choose from. Empty: those of the rule.
         iterations: The most to take.
     """
 

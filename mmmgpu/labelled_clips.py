@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mmmgpu.corpora import check_names
 from mmmgpu.errors import InputError
 from mmmgpu.landmarks import read_landmarks
 from mmmgpu.marking import LANDMARK_ROWS
@@ -70,12 +71,7 @@ def read_labelled_clips(
     Raises:
         InputError: Of the first clip that cannot be used.
     """
-    names = [clip.stem for clip in clips]
-    double = sorted({name for name in names if names.count(name) > 1})
-    if not clips:
-        raise InputError("no clip given; name at least one video file")
-    if double:
-        raise InputError(f"{double[0]}: two clips have this name; rename one of them")
+    check_names(clips)
     labelled = [read_labelled_clip(clip, folder, rows) for clip in clips]
     number = labelled[0].points.shape[1]
     for other in labelled[1:]:

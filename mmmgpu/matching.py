@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.analysis import fit_mixture
+from mmmgpu.analysis import solve_simplex
 from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.basis import LIP, MOUTH, Basis
 from mmmgpu.correspondence import Correspondence
@@ -203,10 +203,20 @@ def texture_coordinates(
         warped = kernels.to_host(warp_prototypes(basis, basis.flows[k], others, kernels))
         warped = warped.reshape(len(others), -1, 3)
         column = np.zeros(len(every))
-        column[others] = fit_mixture(warped, source.images[k], pixels, weight)
+        column[others] = _fit_mixture(warped, source.images[k], pixels, weight)
         return column
 
     return np.stack(list(map_ordered(one, every.tolist(), threads=default_threads())), axis=1)
+
+
+def _fit_mixture(warped: F32, image: F32, pixels: NDArray[np.int64], weight: F32) -> Floats:
+    """The weights (n,) on the simplex with which pictures mix to `image` best.
+
+    warped: (n, h w, 3). image: (h, w, 3). pixels, weight: those that count, and sqrt(w_t) there.
+    """
+    a = (warped[:, pixels] * weight[:, None]).reshape(len(warped), -1)
+    b = (image.reshape(-1, 3)[pixels] * weight[:, None]).ravel()
+    return solve_simplex(a @ a.T, a @ b)
 
 
 def synthetic_flows(views: Sequence[View], view: Numbers, shape: tuple[int, int]) -> F32:

@@ -1,12 +1,10 @@
-import json
 import pickle
-import struct
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from safetensors.numpy import load_file, save_file
+from rewriting import rewritten
 
 from mmmgpu.aam_files import KIND, load_aam, save_aam
 from mmmgpu.errors import InputError
@@ -47,19 +45,6 @@ def test_the_same_model_is_the_same_file(drawn, data, tmp_path):
     for i in range(4):
         save_aam(drawn.aam, tmp_path / f"{i}.aam")
         assert (tmp_path / f"{i}.aam").read_bytes() == data
-
-
-def rewritten(path, data, *, tensors=None, facts=None, metadata=None):
-    """The good file with some tensors or header entries changed."""
-    path.write_bytes(data)
-    known = load_file(str(path))
-    (length,) = struct.unpack("<Q", data[:8])
-    said = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["mmmgpu"])
-    known.update(tensors(known) if tensors else {})
-    known = {name: np.ascontiguousarray(t) for name, t in known.items() if t is not None}
-    said.update(facts(said) if facts else {})
-    said = {name: value for name, value in said.items() if value != "gone"}
-    save_file(known, str(path), metadata=metadata or {"mmmgpu": json.dumps(said)})
 
 
 NOTHING = {

@@ -8,7 +8,7 @@ import pytest
 from mmmgpu.adaptation_folds import METHODS, adapt_models
 from mmmgpu.errors import InputError
 from mmmgpu.gdlr import (
-    RATES,
+    RULES,
     Descent,
     bounded_steps,
     descend_means,
@@ -173,7 +173,7 @@ def test_gdlr_stops_early_where_there_is_little_to_learn():
     assert (np.diff(training) < 0).all()
     assert adapted.iterations == validation.argmin() < 5
     assert validation[-1] > validation[adapted.iterations]
-    assert {own["rate"] for own in adapted.candidates} == set(RATES["bounded"])
+    assert {own["rate"] for own in adapted.candidates} == set(RULES["bounded"].rates)
 
 
 def test_a_descent_that_diverges_leaves_the_models_as_they_are(world):

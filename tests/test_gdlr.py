@@ -6,7 +6,6 @@ from oracles_adaptation import dense_follow, regression_slope
 
 from mmmgpu.errors import InputError
 from mmmgpu.gdlr import (
-    RATES,
     RULES,
     Descent,
     class_curvature,
@@ -58,7 +57,7 @@ def dense_arguments(models, clips):
 
 
 def descend(system, mean, z, rule="bounded", *, rate=1.0, iterations=30, class_of=CLASS_OF):
-    steps = rate * RULES[rule](system, mean, class_of)
+    steps = rate * RULES[rule].steps(system, mean, class_of)
     return descend_means(system, mean, z, class_of, steps=steps, iterations=iterations)
 
 
@@ -143,10 +142,10 @@ def test_steps_are_by_the_curvature_and_never_longer_than_by_that_bound():
     L = class_curvature(system.line.phone, models.mean, CLASS_OF)
     c = gain(system, models.mean, CLASS_OF, 1 / L)
     assert (c > 2).all()
-    steps = RULES["bounded"](system, models.mean, CLASS_OF)
+    steps = RULES["bounded"].steps(system, models.mean, CLASS_OF)
     np.testing.assert_allclose(steps, 1 / (L[:, None] * c), rtol=1e-12)
     calm = factor_system(system.line, models, np.full(3, 1e-9))  # nothing is smoothed: c = 1
-    steps = RULES["bounded"](calm, models.mean, CLASS_OF)
+    steps = RULES["bounded"].steps(calm, models.mean, CLASS_OF)
     np.testing.assert_allclose(steps, np.tile(1 / L[:, None], 3), rtol=1e-6)
 
 
@@ -166,7 +165,7 @@ def errors(system, path, z):
 
 
 @pytest.mark.parametrize("kind", DENSE)
-@pytest.mark.parametrize("rate", RATES["bounded"])
+@pytest.mark.parametrize("rate", RULES["bounded"].rates)
 @pytest.mark.parametrize("smoothness", [0.01, 1.0, 100.0])
 def test_training_error_falls_with_every_iteration(kind, rate, smoothness):
     rng = np.random.default_rng(5)
