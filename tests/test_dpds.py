@@ -1,5 +1,5 @@
 import numpy as np
-from oracles_dynamics import dpds_path, drawn_labels
+from oracles_dynamics import dpds_least_squares, dpds_path, drawn_labels
 from scipy.stats import norm
 
 from mmmgpu.dpds import Dpds
@@ -74,7 +74,10 @@ def test_labels_that_start_nothing_or_are_never_entered_have_their_mean():
     _, b, c, s = range(4)
     of_b = np.concatenate([y[0][[2, 3, 5]], y[1][[3]]])
     np.testing.assert_allclose(model.mu[b], of_b.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(model.mu[s], (y[0][0] + y[1][0]) / 2, atol=2)
+    rows = [[model.labels.index(label) for label in own] for own in labels]
+    for j in range(2):
+        wanted = dpds_least_squares(model.A[:-1, j], rows, [one[:, j] for one in y])
+        np.testing.assert_allclose(model.mu[s, j], wanted[s], rtol=1e-8)
     np.testing.assert_array_equal(model.A[c], model.A[-1])
     np.testing.assert_allclose(model.nu[c], (1 - model.A[c]) * y[2][0], rtol=1e-12)
     np.testing.assert_allclose(model.mu[-1], np.concatenate(y).mean(axis=0), rtol=1e-12)
