@@ -57,9 +57,9 @@ def check_names(clips: Sequence[Path]) -> None:
     if not clips:
         raise InputError("no clip given; name at least one video file")
     names = [clip.stem for clip in clips]
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise InputError(f"{double[0]}: two clips have this name; rename one of them")
+    for i, clip in enumerate(clips):
+        if clip.stem in names[:i]:
+            raise InputError(f"{clip}: two clips are called {clip.stem}; rename one of them")
 
 
 def _check_size(first: VideoInfo, other: VideoInfo) -> None:

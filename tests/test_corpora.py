@@ -80,7 +80,7 @@ def text(folder):
 
 BAD = {
     "no clip": (lambda folder: [], "no clip given"),
-    "equal names": (rename, "a b: two clips"),
+    "equal names": (rename, "a b.mp4: two clips are called a b"),
     "missing": (without(".mkv"), "-c.mkv: no such file"),
     "no alignment": (without(".TextGrid"), "holds no alignment of .*-c.mkv"),
     "alignment too long": (late, r"-c.TextGrid: ends at 1.60 s but the clip ends at 1.00 s"),

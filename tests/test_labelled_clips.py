@@ -149,7 +149,7 @@ def test_clips_go_together(clip, tmp_path):
     save(save(tmp_path, [SHAPE[:50]] * 4), [SHAPE[:51]] * 4, "c")
     with pytest.raises(InputError, match=r"c\.mkv: has 51 landmarks a frame, .*a b\.mkv has 50"):
         read_labelled_clips([clip, other], tmp_path, None)
-    with pytest.raises(InputError, match="a b: two clips have this name"):
+    with pytest.raises(InputError, match="two clips are called a b"):
         read_labelled_clips([clip, tmp_path / "sub" / "a b.mp4"], tmp_path, None)
     with pytest.raises(InputError, match="no clip given"):
         read_labelled_clips([], tmp_path, None)
