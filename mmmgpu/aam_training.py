@@ -4,7 +4,7 @@ Frames are read one at a time. What is learned from is a bounded number of frame
 over all clips, so that memory does not grow with them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from mmmgpu.meshes import Mesh, doubled_areas, fold_depths, make_mesh, triangula
 from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.progress import progress
 from mmmgpu.shapes import align, procrustes_mean
-from mmmgpu.videos import read_frames
+from mmmgpu.videos import read_chosen_frames
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -175,7 +175,7 @@ def _read_textures(
     def one(item: tuple[LabelledClip, Numbers], _: Cancelled) -> F32:
         clip, chosen = item
         at = reduce_points(clip.points[chosen], reduction)
-        pictures = _chosen_frames(clip, clip.frames[chosen])
+        pictures = read_chosen_frames(clip.path, clip.frames[chosen])
         read = [
             read_texture(mesh, reduce_picture(picture, reduction), p, kernels)
             for picture, p in zip(pictures, at, strict=True)
@@ -190,17 +190,6 @@ def _read_textures(
         textures[end : end + len(part)] = part
         end += len(part)
     return textures
-
-
-def _chosen_frames(clip: LabelledClip, chosen: Numbers) -> Iterator[NDArray[np.uint8]]:
-    """The frames `chosen`, rising, of a clip."""
-    if not len(chosen):
-        return
-    wanted = set(chosen.tolist())
-    first, stop = int(chosen[0]), int(chosen[-1]) + 1
-    for t, frame in enumerate(read_frames(clip.path, start=first, stop=stop), start=first):
-        if t in wanted:
-            yield frame
 
 
 def _in_one_light(textures: F32, names: Sequence[str]) -> F32:
