@@ -24,6 +24,7 @@ from mmmgpu.commands import (
     transfer,
 )
 from mmmgpu.commands.endings import INTERRUPTED, guarded, prompt_interrupts
+from mmmgpu.errors import say_warnings
 
 app = typer.Typer(
     name="mmmgpu",
@@ -81,6 +82,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # any file name can be shown
     prompt_interrupts()
+    say_warnings()
     try:
         app()
     except SystemExit as end:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from mmmgpu.comparison_features import Eye, Features
 from mmmgpu.comparison_scores import Scores, paired_tests, score, summarise
 from mmmgpu.corpora import Clip
 from mmmgpu.dynamics import MODELS, Dynamics, Generative, trajectory
-from mmmgpu.errors import InputError
+from mmmgpu.errors import InputError, UnsettledWarning
 from mmmgpu.files import require_folder
 from mmmgpu.labelled import Floats, check_sequence, stand_ins
 from mmmgpu.processes import Tick, Work, share_out
@@ -157,10 +158,11 @@ class _Fold:
         for i in (*others, *self.own):
             y[i] = self._seen(eye, i, y[others[0]].shape[1] if y else None)
         labels = [self.corpus[i].labels for i in others]
+        unsettled: list[str] = []
         scores: dict[str, Scores] = {}
         sentences: dict[str, dict[str, Scores]] = {self._name(i): {} for i in self.own}
         for name, kind in MODELS.items():
-            with self._named(name):
+            with self._named(name), _noting(unsettled):
                 model = kind.fit([y[i] for i in others], labels)
             made, likely = [], []
             for i in self.own:
@@ -176,7 +178,12 @@ class _Fold:
             self._show(eye, REALITY, i, y[i])
         spoken = [label for i in self.own for label in self.corpus[i].labels]
         known = sorted({label for row in labels for label in row})
-        return {"scores": scores, "sentences": sentences, "stand_ins": stand_ins(known, spoken)}
+        return {
+            "scores": scores,
+            "sentences": sentences,
+            "stand_ins": stand_ins(known, spoken),
+            "unsettled": unsettled,
+        }
 
     def _name(self, i: int) -> str:
         return self.corpus[i].path.stem
@@ -210,6 +217,19 @@ class _Fold:
             raise InputError(f"fold {self.number + 1}, {what}: {e}") from e
 
 
+@contextmanager
+def _noting(unsettled: list[str]) -> Iterator[None]:
+    """Adds to `unsettled` which fits were ended by their cap on iterations."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UnsettledWarning)
+        yield
+    for one in said:
+        if issubclass(one.category, UnsettledWarning):
+            unsettled.append(str(one.message))
+        else:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+
+
 def _read(folder: Path, fold: int) -> dict[str, Any]:
     step = read_step(folder, f"fold-{fold}")
     assert step is not None, fold
@@ -218,17 +238,17 @@ def _read(folder: Path, fold: int) -> dict[str, Any]:
 
 
 def _gathered(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """All folds together; one warning tells of the labels that some fold had to replace."""
-    missing: dict[str, dict[str, str]] = {}
-    for number, result in enumerate(results, start=1):
-        if result["stand_ins"]:
-            missing[f"fold {number}"] = result["stand_ins"]
+    """All folds together; warnings tell of labels that some fold had to replace, and of fits."""
+    missing, unsettled = _by_fold(results, "stand_ins"), _by_fold(results, "unsettled")
     if missing:
         said = "; ".join(
             f"{fold}: " + ", ".join(f"{other} for {label}" for label, other in own.items())
             for fold, own in missing.items()
         )
         print(f"warning: not in every fold's training sentences: {said}", file=sys.stderr)
+    if unsettled:
+        said = "; ".join(f"{fold}: {', '.join(own)}" for fold, own in unsettled.items())
+        print(f"warning: fits that were ended early: {said}", file=sys.stderr)
     scores = [result["scores"] for result in results]
     return {
         "models": summarise(scores),
@@ -236,4 +256,10 @@ def _gathered(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "folds": scores,
         "sentences": {k: v for r in results for k, v in sorted(r["sentences"].items())},
         "stand_ins": missing,
+        "unsettled": unsettled,
     }
+
+
+def _by_fold(results: Sequence[Mapping[str, Any]], what: str) -> dict[str, Any]:
+    """What the folds, counted from 1, have to tell; those that have nothing are left out."""
+    return {f"fold {n}": r[what] for n, r in enumerate(results, start=1) if r[what]}

@@ -18,6 +18,7 @@ Source: Englebienne, Cootes & Rattray (NIPS 2007), section 3.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -25,6 +26,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mmmgpu.errors import UnsettledWarning
 from mmmgpu.flat_records import tensor
 from mmmgpu.kalman import Posterior, System, inverse, multiply, smooth, symmetric, transpose
 from mmmgpu.labelled import (
@@ -135,14 +137,14 @@ def in_blocks(parameter: Floats, *, full: bool) -> Floats:
 
 
 def climb(
-    data: Labelled, *, full: bool = False, iterations: int = 100, tolerance: float = 1e-4
+    data: Labelled, *, full: bool = False, iterations: int = 1000, tolerance: float = 1e-4
 ) -> tuple[Slds, list[float]]:
     """EM from a start that the pooled Gaussians give.
 
     Args:
         data: What to fit.
         full: As in `Slds.fit`.
-        iterations: At most so many.
+        iterations: At most so many; an `UnsettledWarning` says that they were too few.
         tolerance: The climb ends when an iteration gains less [nats a frame and dimension].
 
     Returns:
@@ -161,6 +163,9 @@ def climb(
             return model, history
         model = _maximise(model, found, least)
     history.append(_expect(model.system, parts, len(data.labels))[1])
+    warnings.warn(
+        UnsettledWarning(f"slds: still gaining after {iterations} iterations"), stacklevel=2
+    )
     return model, history
 
 

@@ -1,4 +1,5 @@
 import json
+import warnings
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +16,7 @@ from mmmgpu.comparison_scores import METRICS, score
 from mmmgpu.corpora import Clip
 from mmmgpu.dpds import Dpds
 from mmmgpu.dynamics import MODELS, trajectory
-from mmmgpu.errors import InputError
+from mmmgpu.errors import InputError, UnsettledWarning
 from mmmgpu.hmm_mean import HmmMean
 from mmmgpu.videos import VideoInfo
 
@@ -109,6 +110,26 @@ def run_here(monkeypatch):
     monkeypatch.setattr(comparison, "share_out", share_out)
     few_models(monkeypatch)
     return done
+
+
+class Hasty(HmmMean):
+    """A model whose fit was ended early."""
+
+    @classmethod
+    def fit(cls, sequences, labels):
+        warnings.warn(UnsettledWarning("hmm: still gaining after 7 iterations"), stacklevel=2)
+        return HmmMean.fit(sequences, labels)
+
+
+def test_a_fit_that_was_ended_early_is_said_once_and_kept(tmp_path, monkeypatch, capfd):
+    run_here(monkeypatch)
+    monkeypatch.setattr(comparison, "MODELS", {"hmm": Hasty})
+    options = CompareOptions(folds=2)
+    results = compare(corpus(tmp_path), SavedFeatures(tmp_path), tmp_path / "w", options=options)
+    one = ["hmm: still gaining after 7 iterations"]
+    assert results["unsettled"] == {"fold 1": one, "fold 2": one}
+    said = "warning: fits that were ended early: fold 1: hmm: still gaining after 7 iterations; "
+    assert capfd.readouterr().err.count(said) == 1
 
 
 def test_a_killed_comparison_goes_on_and_ends_in_the_same(tmp_path, monkeypatch):

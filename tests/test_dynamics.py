@@ -55,6 +55,18 @@ def test_the_same_twice_is_the_same_bits_and_the_data_stay(fitted, name):
     np.testing.assert_array_equal(np.concatenate(y), np.concatenate(before))
 
 
+@EVERY
+def test_features_in_other_units_make_the_same_movement(fitted, name):
+    y, labels = corpus()
+    said, unit = ["SIL", "AA", "M", "M", "S"], 1000.0
+    other = MODELS[name].fit([unit * one for one in y], labels)
+    made = trajectory(fitted[name], said)
+    np.testing.assert_allclose(trajectory(other, said), unit * made, rtol=1e-5, atol=1e-5 * unit)
+    if isinstance(other, Generative):
+        value = fitted[name].log_likelihood(y[0], labels[0]) - np.log(unit) * y[0].size
+        np.testing.assert_allclose(other.log_likelihood(unit * y[0], labels[0]), value, rtol=1e-5)
+
+
 def test_comparable_models_are_distributions_and_the_others_say_so(fitted):
     comparable = {name for name, model in fitted.items() if model.comparable}
     assert comparable == {"hmm", "slds", "dpds"}
