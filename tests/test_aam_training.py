@@ -171,6 +171,7 @@ def freeze(points):
     ("options", "says"),
     [
         ({"parameters": 0}, "parameters must be at least 1"),
+        ({"parameters": 3, "variance": 0.9}, "parameters and variance: .* give one of them"),
         ({"variance": 0.0}, "variance must be a share"),
         ({"variance": 1.2}, "variance must be a share"),
         ({"variance": float("nan")}, "variance must be a share"),

@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 from commands import assert_refused, run_command
+from pairs import write_landmarks
 
 from mmmgpu.corpora import open_corpus
-from mmmgpu.dynamics import MODELS
+from mmmgpu.dynamics import FIVE
 
 
 @pytest.fixture
@@ -40,10 +41,43 @@ def test_compare(mmmgpu, world, saved, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == names
     results = json.loads((tmp_path / "results.json").read_text())
     assert results == json.loads((out / "compare.json").read_text())
-    assert list(results["models"]) == list(MODELS)
+    assert list(results["models"]) == list(FIVE)
+    assert set(results["not_comparable"]) == {"brand", "egp02"}
+    assert "no distribution of the features" in results["not_comparable"]["brand"]
+    assert "log-likelihood not comparable: brand, egp02 (no" in " ".join(ended.out.split())
     assert "4 sentences, 2 folds" in ended.out
     assert "hmm - brand" in ended.out
     assert ended.err.count("warning: ") == bool(results["stand_ins"])
+
+
+def test_compare_some_models_with_features_of_ones_own_choice(mmmgpu, world, tmp_path):
+    """The models and the appearance model that were asked for, through processes."""
+    write_landmarks(world)
+    chosen = ("--landmarks", world.alignments, "--parameters", 3, "--models", "slds-full, hmm")
+    ended = mmmgpu(*asked(world, "aam", tmp_path, *chosen))
+    assert ended.status == 0
+    results = json.loads((tmp_path / "compare.json").read_text())
+    assert list(results["models"]) == ["slds-full", "hmm"]
+    assert {one["first"] for one in results["tests"]} == {"slds-full"}
+    assert results["not_comparable"] == {}
+    assert "not comparable" not in ended.out
+
+
+USES = [
+    ("mmm", ("--parameters", 3), "aam"),
+    ("mmm", ("--all-points",), "aam"),
+    ("aam", ("--region", "1,2,3,4"), "mmm"),
+    (".", ("--region", "1,2,3,4"), "mmm"),
+    (".", ("--parameters", 3), "aam"),
+]
+
+
+@pytest.mark.parametrize(("features", "more", "kind"), USES)
+def test_options_of_other_features_are_refused(mmmgpu, world, tmp_path, features, more, kind):
+    ended = mmmgpu(*asked(world, features, tmp_path / "a", *more))
+    assert ended.status == 2
+    assert f"Invalid value for {more[0]}: is for --features {kind}" in ended.err
+    assert not (tmp_path / "a").exists()
 
 
 def test_what_cannot_be_compared_is_refused(mmmgpu, world, saved, tmp_path):
@@ -52,4 +86,7 @@ def test_what_cannot_be_compared_is_refused(mmmgpu, world, saved, tmp_path):
     assert_refused(mmmgpu(*asked(world, "aam", tmp_path / "a")), "--landmarks")
     assert_refused(mmmgpu(*asked(world, tmp_path / "none", tmp_path / "a")), "none")
     assert_refused(mmmgpu(*asked(world, saved, tmp_path / "a", "--folds", "5")), "4", "5")
+    for names in ("hmm,sdls", "hmm,hmm", ""):
+        ended = mmmgpu(*asked(world, saved, tmp_path / "a", "--models", names))
+        assert_refused(ended, "models must be some of hmm, brand, slds", repr(names))
     assert list(tmp_path.rglob("*.*")) == []

@@ -56,7 +56,9 @@ def test_a_file_without_features_is_named(clips, tmp_path, fault):
 
 def test_names_on_the_command_line(tmp_path):
     given = {"alignments": tmp_path, "options": {"sync": 0.5}, "backend": "numpy"}
-    assert features_named("aam", landmarks=tmp_path, **given) == AamFeatures(tmp_path, "numpy")
+    aam = features_named("aam", landmarks=tmp_path, **given | {"options": {"parameters": 4}})
+    assert aam == AamFeatures(tmp_path, "numpy", {"parameters": 4})
+    assert aam.facts() != AamFeatures(tmp_path, "numpy").facts()
     mmm = features_named("mmm", landmarks=None, **given)
     assert mmm == MmmFeatures(tmp_path, "numpy", Options(sync=0.5))
     assert features_named(str(tmp_path), landmarks=None, **given) == SavedFeatures(tmp_path)

@@ -19,10 +19,10 @@ from mmmgpu.dynamics import (
     trajectory,
 )
 from mmmgpu.errors import InputError
-from mmmgpu.slds import Slds
+from mmmgpu.slds import FullSlds
 
 EVERY = pytest.mark.parametrize("name", MODELS)
-STREAMING = pytest.mark.parametrize("name", ["hmm", "slds", "dpds"])
+STREAMING = pytest.mark.parametrize("name", ["hmm", "slds", "dpds", "slds-full"])
 
 
 def corpus(seed=0, number=4, d=2):
@@ -69,7 +69,7 @@ def test_features_in_other_units_make_the_same_movement(fitted, name):
 
 def test_comparable_models_are_distributions_and_the_others_say_so(fitted):
     comparable = {name for name, model in fitted.items() if model.comparable}
-    assert comparable == {"hmm", "slds", "dpds"}
+    assert comparable == {"hmm", "slds", "dpds", "slds-full"}
     assert {name for name, model in fitted.items() if isinstance(model, Generative)} == comparable
 
 
@@ -166,7 +166,7 @@ def test_a_phone_of_one_frame_and_features_that_do_not_move_can_be_fitted(name):
 def test_full_covariances_of_singular_features_are_kept_regular():
     y, labels = corpus()
     y = [np.column_stack([one, np.zeros(len(one)), one[:, 0]]) for one in y]
-    model = Slds.fit(y, labels, full=True)
+    model = FullSlds.fit(y, labels)
     for covariance in (model.Sigma, model.Q, model.R):
         assert (np.linalg.eigvalsh(covariance) > 0).all()
     assert np.isfinite(trajectory(model, labels[0])).all()
@@ -193,12 +193,6 @@ def test_a_model_comes_back_bit_for_bit(fitted, tmp_path, name):
         assert np.asarray(got).dtype == np.asarray(want).dtype
     save_dynamics(again, tmp_path / "b.model")
     assert (tmp_path / "b.model").read_bytes() == (tmp_path / "a ü.model").read_bytes()
-
-
-def test_full_covariances_come_back_too(tmp_path):
-    model = Slds.fit(*corpus(), full=True)
-    save_dynamics(model, tmp_path / "a")
-    np.testing.assert_array_equal(load_dynamics(tmp_path / "a").Q, model.Q)
 
 
 @pytest.fixture(scope="module")
@@ -272,7 +266,7 @@ def test_a_bad_file_is_said_on_one_line(data, tmp_path, fault):
 
 
 def test_a_singular_covariance_in_a_file_is_refused(tmp_path):
-    model = Slds.fit(*corpus(), full=True)
+    model = FullSlds.fit(*corpus())
     model.Q[0] = 1
     save_dynamics(model, tmp_path / "bad")
     with pytest.raises(InputError, match="bad: tensor Q must be positive definite"):

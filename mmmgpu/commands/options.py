@@ -38,6 +38,11 @@ def parse_box(text: str) -> Box:
     return x, y, width, height
 
 
+def split_names(text: str) -> tuple[str, ...]:
+    """The names in "A,B,..."."""
+    return tuple(name.strip() for name in text.split(","))
+
+
 ModelFile = Annotated[
     Path, typer.Argument(metavar="MODEL", help="A model file, written by: mmmgpu train.")
 ]
