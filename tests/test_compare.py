@@ -1,12 +1,15 @@
 """The command ``mmmgpu compare``, with features that were saved."""
 
+import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import assert_refused, run_command
 from pairs import write_landmarks
 
+from mmmgpu.commands.compare import _learning
 from mmmgpu.corpora import open_corpus
 from mmmgpu.dynamics import FIVE
 
@@ -63,9 +66,39 @@ def test_compare_some_models_with_features_of_ones_own_choice(mmmgpu, world, tmp
     assert "not comparable" not in ended.out
 
 
+def test_compare_with_alpha_and_beta(mmmgpu, world, tmp_path):
+    """A morphable model is learned in every fold, through processes."""
+    few = ("--prototypes", 3, "--models", "hmm", "--videos", tmp_path / "videos")
+    args = asked(world, "mmm", tmp_path / "out", *few)
+    args = [arg for arg in args if arg not in world.clips[2:]]
+    ended = mmmgpu(*args)
+    assert ended.status == 0, ended.err
+    results = json.loads((tmp_path / "out" / "compare.json").read_text())
+    names = [clip.stem for clip in world.clips[:2]]
+    assert sorted(results["sentences"]) == names
+    assert results["models"]["hmm"]["l1"]["folds"] == 2
+    made = {path.relative_to(tmp_path / "videos") for path in tmp_path.glob("videos/*/*")}
+    wanted = itertools.product(("hmm", "reality"), names)
+    assert made == {Path(condition) / f"{name}.mp4" for condition, name in wanted}
+
+
+def test_options_reach_the_features(mmmgpu, world, tmp_path):
+    write_landmarks(world)
+    args = asked(world, "aam", tmp_path / "a", "--landmarks", world.alignments)
+    ended = mmmgpu(*args, "--parameters", 900)
+    assert ended.status == 1
+    assert "features: 90 labelled frame(s) are too few for 900 parameters" in ended.err
+    assert _learning("aam", 0.5, {"parameters": None, "region": None}) == {}
+    chosen = {"parameters": 4, "all_points": True}
+    assert _learning("aam", 0.5, chosen) == {"parameters": 4, "rows": None}
+    chosen = {"region": (1, 2, 3, 4), "prototypes": None}
+    assert _learning("mmm", 0.5, chosen) == {"sync": 0.5, "region": (1, 2, 3, 4)}
+
+
 USES = [
     ("mmm", ("--parameters", 3), "aam"),
     ("mmm", ("--all-points",), "aam"),
+    ("aam", ("--prototypes", 4), "mmm"),
     ("aam", ("--region", "1,2,3,4"), "mmm"),
     (".", ("--region", "1,2,3,4"), "mmm"),
     (".", ("--parameters", 3), "aam"),

@@ -103,10 +103,10 @@ def test_a_morphable_model_is_trained_on_the_folds_clips_and_shows_others(
 
 def test_features_of_an_appearance_model_are_shown_as_faces(world, clips, tmp_path):
     write_landmarks(world)
-    source = AamFeatures(world.alignments, "warp")
+    source = AamFeatures(world.alignments, "warp", {"parameters": 30})
     eye = source.learn(clips[:2], tmp_path, 0)
     y = eye.features(clips[2])
-    assert y.shape == (clips[2].info.frames, 32)
+    assert y.shape == (clips[2].info.frames, 30)
     np.testing.assert_array_equal(y, features(eye.aam, clips[2].path, world.alignments))
     eye.render(clips[2], y, tmp_path / "reality.mp4")
     eye.render(clips[2], np.zeros_like(y), tmp_path / "still.mp4")

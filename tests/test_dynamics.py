@@ -39,6 +39,7 @@ def fitted():
 
 @EVERY
 def test_one_frame_comes_for_each_label(fitted, name):
+    assert type(fitted[name]) is MODELS[name]
     y = trajectory(fitted[name], ["AA", "M", "M", "S"])
     assert y.shape == (4, 2)
     assert y.dtype == np.float64

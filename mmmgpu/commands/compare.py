@@ -1,5 +1,6 @@
 """``mmmgpu compare``: the models of movement, judged by cross-validation."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +23,7 @@ from mmmgpu.errors import InputError
 
 EXAMPLE = "Example: mmmgpu compare clips/ --alignments aligned --landmarks points --out figure4"
 
-ONLY_FOR = {"region": "mmm", "parameters": "aam", "all_points": "aam"}  # --features
+ONLY_FOR = {"region": "mmm", "prototypes": "mmm", "parameters": "aam", "all_points": "aam"}
 
 
 def _standard() -> str:
@@ -63,6 +64,15 @@ def compare(
             "--all-points", help="With --features aam: use all landmarks, not the 38 built in."
         ),
     ] = False,
+    prototypes: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=2,
+            help="With --features mmm: mouth pictures of a model, if not as many as mmmgpu train "
+            "keeps.",
+        ),
+    ] = None,
     models: Annotated[
         str,
         typer.Option(
@@ -104,11 +114,13 @@ def compare(
     compared with what was seen in it: distances, likelihood, correlation, variance and smoothness,
     with 95 % intervals over the folds and paired tests. A killed comparison goes on where it was.
     """
-    given = {"region": region, "parameters": parameters, "all_points": all_points or None}
-    for name, kind in ONLY_FOR.items():
-        if given[name] is not None and features != kind:
-            option = f"--{name.replace('_', '-')}"
-            raise typer.BadParameter(f"is for --features {kind}", param_hint=option)
+    chosen = {
+        "region": None if region is None else parse_box(region),
+        "prototypes": prototypes,
+        "parameters": parameters,
+        "all_points": all_points or None,
+    }
+    learned_with = _learning(features, sync, chosen)
     found = videos_in(clips)
     require_output(json, found)
     require_output(out / "compare.json", found)
@@ -125,7 +137,7 @@ def compare(
         features,
         alignments=alignments,
         landmarks=landmarks,
-        options=_options(features, sync, region, parameters, all_points=all_points),
+        options=learned_with,
         backend=backend,
     )
     if videos is not None and isinstance(source, SavedFeatures):
@@ -143,11 +155,13 @@ def compare(
     write_results(results, json)
 
 
-def _options(
-    features: str, sync: float, region: str | None, parameters: int | None, *, all_points: bool
-) -> dict[str, Any]:
-    """What the features are learned with, where it was asked for."""
-    if features == "mmm":
-        return {"sync": sync, "region": None if region is None else parse_box(region)}
-    chosen = {} if parameters is None else {"parameters": parameters}
-    return chosen | ({"rows": None} if all_points else {})
+def _learning(features: str, sync: float, chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """What the features are learned with, of the options that were `chosen` (not None)."""
+    given = {name: value for name, value in chosen.items() if value is not None}
+    for name in given:
+        if ONLY_FOR[name] != features:
+            option = f"--{name.replace('_', '-')}"
+            raise typer.BadParameter(f"is for --features {ONLY_FOR[name]}", param_hint=option)
+    if given.pop("all_points", False):
+        given["rows"] = None
+    return {"sync": sync, **given} if features == "mmm" else given
