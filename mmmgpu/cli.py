@@ -20,6 +20,7 @@ from mmmgpu.commands import (
     reconstruct,
     speak,
     study,
+    track,
     train,
     transfer,
 )
@@ -62,6 +63,7 @@ for _command, _example in (
     (demo.demo, demo.EXAMPLE),
     (align.align, align.EXAMPLE),
     (aam.aam, aam.EXAMPLE),
+    (track.track, track.EXAMPLE),
     (train.train, train.EXAMPLE),
     (reconstruct.reconstruct, reconstruct.EXAMPLE),
     (speak.speak, speak.EXAMPLE),
