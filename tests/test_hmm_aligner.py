@@ -102,8 +102,9 @@ def test_the_same_bits_again_and_after_an_interruption(foreign, trained, tmp_pat
     assert same(again.hmms, trained.hmms)
 
 
-def test_a_misfit_is_how_much_better_other_phones_explain_the_frames(foreign, trained):
-    recording = foreign[0][0]
+def test_a_misfit_is_how_much_better_other_phones_explain_the_frames(lexicon, trained):
+    samples, _ = utter("Mása so", np.random.default_rng(6), pause=0.5)
+    recording = make_recording(samples, RATE, look_up("Mása so", lexicon, "a.dict"))
     found, hmms = align(trained.hmms, recording), trained.hmms
     gaps = []
     for t, x in enumerate(recording.features):
@@ -125,6 +126,7 @@ def test_a_misfit_is_how_much_better_other_phones_explain_the_frames(foreign, tr
         (own,) = [p.label for p in found.phones if p.start <= (t + 0.5) / 100 < p.end]
         if own != SIL:
             gaps.append(max(likely.values()) - likely[own])
+    assert 10 < len(gaps) < len(recording.features) - 10  # the others are silent
     np.testing.assert_allclose(misfit(hmms, recording, found), np.mean(gaps), rtol=1e-6)
 
 
