@@ -104,7 +104,8 @@ def test_the_same_bits_again_and_after_an_interruption(foreign, trained, tmp_pat
 
 def test_a_misfit_is_how_much_better_other_phones_explain_the_frames(lexicon, trained):
     samples, _ = utter("Mása so", np.random.default_rng(6), pause=0.5)
-    recording = make_recording(samples, RATE, look_up("Mása so", lexicon, "a.dict"))
+    words = look_up("Osim so", lexicon, "a.dict")  # not what is said
+    recording = make_recording(samples, RATE, words)
     found, hmms = align(trained.hmms, recording), trained.hmms
     gaps = []
     for t, x in enumerate(recording.features):
@@ -127,6 +128,7 @@ def test_a_misfit_is_how_much_better_other_phones_explain_the_frames(lexicon, tr
         if own != SIL:
             gaps.append(max(likely.values()) - likely[own])
     assert 10 < len(gaps) < len(recording.features) - 10  # the others are silent
+    assert np.mean(gaps) > 1
     np.testing.assert_allclose(misfit(hmms, recording, found), np.mean(gaps), rtol=1e-6)
 
 
