@@ -1,4 +1,6 @@
-"""The one error that a user is meant to read."""
+"""The one error that a user is meant to read, and the one warning."""
+
+import warnings
 
 
 class InputError(ValueError):
@@ -7,3 +9,20 @@ class InputError(ValueError):
     The message is one line that says what is wrong, where, and what to do; the command line prints
     it as it is and exits with status 1. It is never raised for a defect of mmmgpu itself.
     """
+
+
+class UnsettledWarning(UserWarning):
+    """A fit was ended by its cap on iterations, not by its own rule: it might get better."""
+
+
+def say_warnings() -> None:
+    """Print warnings to the standard error as one line each, as the command line does.
+
+    Those of one text are said once.
+    """
+
+    def say(message: Warning | str, category: type[Warning], *_: object, **__: object) -> str:
+        return f"warning: {message}\n"
+
+    warnings.formatwarning = say
+    warnings.simplefilter("once", UnsettledWarning)
