@@ -12,6 +12,7 @@ from mmmgpu.commands import (
     aam,
     adapt,
     align,
+    bench,
     compare,
     demo,
     evaluate,
@@ -72,6 +73,7 @@ for _command, _example in (
     (info.info, info.EXAMPLE),
 ):
     app.command(epilog=_example)(guarded(_command))
+app.add_typer(bench.app, name="bench")
 app.add_typer(study.app, name="study")
 
 

@@ -36,6 +36,7 @@ LAYERS = {
     "mmmgpu.errors": 1,
     "mmmgpu.arrays": 1,
     "mmmgpu.backends": 1,
+    "mmmgpu.bench.__main__": 3,
     "mmmgpu.cli": 3,
     "mmmgpu.commands": 3,
     "mmmgpu.__main__": 3,
@@ -56,13 +57,14 @@ def tracked_files():
 
 
 TRACKED = tracked_files()
-MODULES = [*ROOT.glob("kernels/*.py"), *ROOT.glob("mmmgpu/**/*.py")]
+OUTSIDE = ("bench", "kernels")  # folders that are installed as mmmgpu.NAME
+MODULES = [p for name in (*OUTSIDE, "mmmgpu") for p in ROOT.glob(f"{name}/**/*.py")]
 
 
 def module_name(path):
     """The name under which a source file is imported."""
     parts = path.relative_to(ROOT).with_suffix("").parts
-    parts = ("mmmgpu", *parts) if parts[0] == "kernels" else parts
+    parts = ("mmmgpu", *parts) if parts[0] in OUTSIDE else parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
