@@ -38,7 +38,7 @@ def measure_startup(backends, *, turns=3):
 
 def first_frame(backend, cache):
     """Seconds that a new process takes to its first frame, with kernels cached in that folder."""
-    environment = os.environ | {"WARP_CACHE_PATH": cache, "POCL_CACHE_DIR": cache}
+    environment = os.environ | {"WARP_CACHE_PATH": cache, "XDG_CACHE_HOME": cache}
     call = [sys.executable, "-c", FIRST_FRAME, backend]
     start = time.perf_counter()
     done = subprocess.run(call, env=environment, capture_output=True, text=True, check=False)

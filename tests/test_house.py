@@ -35,6 +35,7 @@ LAYERS = {
     "mmmgpu.kernels": 0,
     "mmmgpu.errors": 1,
     "mmmgpu.arrays": 1,
+    "mmmgpu.files": 1,
     "mmmgpu.backends": 1,
     "mmmgpu.bench.__main__": 3,
     "mmmgpu.cli": 3,

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32
 from mmmgpu.backends import default_threads
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
 from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
 
@@ -44,7 +45,6 @@ GONE = {
     cl.status_code.INVALID_CONTEXT,
     cl.status_code.INVALID_DEVICE,
 }
-NO_CACHE = {"POCL_KERNEL_CACHE": "0"}  # a damaged entry would abort the process
 
 
 def open_backend(device: str, threads: int) -> "OpenCL":
@@ -77,13 +77,16 @@ def _present(threads: int) -> dict[str, Any]:
         InputError: There is no driver.
     """
     name_unknown_cpu()
-    with _defaults(dict.fromkeys(THREADS, str(threads)) | NO_CACHE):  # read when a driver loads
+    with _defaults(dict.fromkeys(THREADS, str(threads)) | _cache()):  # read when a driver loads
         try:
             platforms = cl.get_platforms()
         except cl.LogicError:
             raise InputError(NO_PLATFORM) from None
         found = [_devices(platform) for platform in platforms]
     return {f"{i}:{j}": d for i, devices in enumerate(found) for j, d in enumerate(devices)}
+
+
+_cache = functools.cache(cache_variables)
 
 
 def _devices(platform: Any) -> list[Any]:
