@@ -146,15 +146,15 @@ class Launches(ABC):
         shares = self._packed(weights, points, 1, 0, 1)
         distance = self.empty(number, rows)
         pairs = math.ceil(number / 2)
-        sizes = [number, rows, math.ceil(points / LANES), channels]
 
         def scan(first: int, count: int) -> None:
             for start in range(first, first + count, TILE):
                 tile = min(TILE, first + count - start)
                 planes = self._packed(corpus, points, channels, start, tile)
+                sizes = [number, rows, start, tile, math.ceil(points / LANES), channels]
                 inputs = [packed, planes, shares, *sizes]
-                span = start * pairs, tile * pairs
-                self.launch("distance_scan.distance_scan", *span, inputs, [distance])
+                blocks = pairs * math.ceil(tile / 2)
+                self.launch("distance_scan.distance_scan", 0, blocks, inputs, [distance])
 
         self.split(rows, scan)
         return distance
