@@ -20,6 +20,8 @@ from mmmgpu.backends.orientation import orient
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
 LANES = 16  # floats of a vector, as in kernels/blend, distance_scan and rbf
+COLOURS = 3  # channels of a picture, as in kernels/sample
+RUN = 16  # points of a thread, as in kernels/sample
 TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
 
 
@@ -135,8 +137,11 @@ class Launches(ABC):
         sets, number, _ = points.shape
         batch = max(fields, sets)
         sampled = self.empty(batch, number, channels)
-        inputs = [field, points, fields, sets, number, height, width, channels]
-        self.launch_all("sample.sample", batch * number, inputs, [sampled])
+        inputs, runs = [field, points, fields, sets, number, height, width], math.ceil(number / RUN)
+        if channels == COLOURS:
+            self.launch_all("sample.sample_pictures", batch * runs, inputs, [sampled])
+        else:
+            self.launch_all("sample.sample", batch * runs, [*inputs, channels], [sampled])
         return sampled
 
     def distance_scan(self, queries: Any, corpus: Any, weights: Any) -> Any:
