@@ -27,7 +27,7 @@ from mmmgpu.backends import Backend
 from mmmgpu.basis import LIP, MOUTH, Basis, around, cut
 from mmmgpu.errors import InputError
 from mmmgpu.flows import Matcher, concatenate, matcher, pull
-from mmmgpu.planes import pictures, planes
+from mmmgpu.planes import picture, planes
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
@@ -220,7 +220,7 @@ def _fit_texture(
     beta = _fit_beta(analyzer, image, warped, used, scale)
     mixed = (beta[used].astype(np.float32) @ warped).reshape(3, *scale.shape)
     width = image.shape[1]
-    return beta, pictures(mixed[..., :width] / scale[:, :width], width)
+    return beta, picture(mixed[..., :width] / scale[:, :width], width)
 
 
 def _warped(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: F32) -> F32:

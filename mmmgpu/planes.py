@@ -5,8 +5,11 @@ A picture (h, w, C) becomes planes (C, h, pitch). What pads a row counts nowhere
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
 
 LANES = 16  # floats of a vector, as in the kernels
 
@@ -24,6 +27,6 @@ def planes(pictures: NDArray[Any]) -> NDArray[Any]:
     return padded
 
 
-def pictures(planes: NDArray[Any], width: int) -> NDArray[Any]:
-    """Planes (..., C, h, pitch) as pictures (..., h, width, C)."""
-    return np.ascontiguousarray(np.moveaxis(planes[..., :width], -3, -1))
+def picture(planes: F32, width: int) -> F32:
+    """Planes (C, h, pitch) as a picture (h, width, C), for C > 1."""
+    return np.asarray(cv2.merge(list(planes[..., :width])), np.float32)

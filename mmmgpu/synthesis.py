@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.backends import Backend, get_backend
 from mmmgpu.basis import Basis, around, cut
-from mmmgpu.planes import pictures, planes
+from mmmgpu.planes import picture, planes
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -99,9 +99,10 @@ def synthesize_batch(synthesizer: Synthesizer, alpha: Floats, beta: Floats) -> F
     flows = np.tensordot(alpha.astype(np.float32), s.flows, axes=1)
     mixed = k.mix_prototypes(s.held, k.to_device(flows), k.to_device(weights), s.scale)
     made = np.tile(s.outside, (len(alpha), 1, 1, 1))
-    part = made[:, s.inside[0], s.inside[1]]
-    part += pictures(np.clip(k.to_host(mixed), 0, 1), part.shape[2])
-    return made
+    for image, one in zip(made, k.to_host(mixed), strict=True):
+        part = image[s.inside]
+        part += picture(one, part.shape[1])
+    return np.minimum(made, 1, out=made)
 
 
 def warp_prototypes(

@@ -7,7 +7,7 @@ from test_operations_equivalence import FLOWS, SIZES
 
 from mmmgpu.backends import get_backend
 from mmmgpu.errors import InputError
-from mmmgpu.planes import pictures, planes
+from mmmgpu.planes import planes
 
 HOLE = 0.1
 NUMBER = 3
@@ -30,17 +30,19 @@ def some_of(size, rng):
 
 
 def moved(name, images, flows, flow, used, scale, threads=None):
-    k, width = get_backend(name, threads), images.shape[2]
+    k = get_backend(name, threads)
     held = k.hold_prototypes(images, flows, HOLE)
     given = planes(flow[None]), np.int32(used), planes(scale[..., None])[0]
-    return pictures(k.to_host(k.move_prototypes(held, *map(k.to_device, given))), width)
+    made = k.to_host(k.move_prototypes(held, *map(k.to_device, given)))
+    return np.moveaxis(made[..., : images.shape[2]], 1, -1)
 
 
 def mixed(name, images, flows, wanted, weights, scale, threads=None):
-    k, width = get_backend(name, threads), images.shape[2]
+    k = get_backend(name, threads)
     held = k.hold_prototypes(images, flows, HOLE)
     given = planes(wanted), np.float32(weights), planes(scale[..., None])[0]
-    return pictures(k.to_host(k.mix_prototypes(held, *map(k.to_device, given))), width)
+    made = k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
+    return np.moveaxis(made[..., : images.shape[2]], 1, -1)
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -6,7 +6,7 @@ from test_operations_equivalence import FLOWS, SIZES
 from mmmgpu.backends.orientation import orient
 from mmmgpu.errors import InputError
 from mmmgpu.operations import fill_holes, forward_warp
-from mmmgpu.planes import LANES, pictures, pitch_of
+from mmmgpu.planes import LANES, picture, pitch_of
 
 HOLE = 0.1
 STAYING = sorted(set(FLOWS) - {"leaving"})
@@ -67,7 +67,7 @@ def test_what_is_fixed_is_the_flow_carried_along_itself(name):
     flows = make_flows(name, (33, 20))
     o = orient(flows, HOLE)
     for i in range(2):
-        fixed = pictures(o.fixed[i], 20)
+        fixed = picture(o.fixed[i], 20)
         assert_allclose(fixed, applied(o, i, flows[i]), rtol=0, atol=1e-5)
 
 
@@ -77,7 +77,7 @@ def test_pixels_that_stay_need_no_rows():
     assert_array_equal(o.firsts, np.arange(5 * 2 + 1))
     assert_array_equal(o.deltas, 0)
     assert_array_equal(o.shares, np.tile(np.float32(np.arange(32) < 20), 5).reshape(10, LANES))
-    assert_array_equal(pictures(o.fixed, 20), 0)
+    assert_array_equal(o.fixed[..., :20], 0)
 
 
 def test_what_pads_a_row_is_carried_out_of_any_picture():

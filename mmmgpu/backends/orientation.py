@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from mmmgpu.arrays import F32, check_some_valid
+from mmmgpu.backends import default_threads
 from mmmgpu.backends.reference import landings
+from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.planes import LANES, pitch_of, planes
 
 I32 = NDArray[np.int32]
@@ -67,42 +69,61 @@ def orient(flows: F32, hole: float) -> Orientations:
         InputError: A flow leaves no pixel in the picture.
     """
     _, h, w, _ = flows.shape
-    area = h * pitch_of(w)
-    carried = np.empty_like(flows)
-    parts: list[_Parts] = []
-    rows: list[Any] = []
-    targets: list[Numbers] = []
-    cell_numbers, lengths = [], []
-    for i, flow in enumerate(flows):
-        pixels, valid = _splatted(flow, hole)
-        members, through = _filling(valid)
-        cells, holes = members @ pixels, np.flatnonzero(~valid)
-        own = flow.reshape(-1, 2).astype(np.float64)
-        fixed = pixels @ own
-        fixed[holes] = through @ (cells @ own)
-        carried[i] = fixed.reshape(h, w, 2)
-        parts.append(_parts(pixels, w))
-        cells.indices = _padded(cells.indices, w)
-        through.indices += area + LANES
-        rows += [cells, through]
-        targets += [area + LANES + np.arange(cells.shape[0]), _padded(holes, w)]
-        lengths.append(cells.shape[0] + len(holes))
-        cell_numbers.append(cells.shape[0])
-    counts = np.concatenate([np.diff(r.indptr) for r in rows])
-    fixed = planes(carried)
+
+    def one(flow: F32, _: Cancelled) -> _Oriented:
+        return _orient_one(flow, hole)
+
+    done = list(map_ordered(one, flows, threads=default_threads()))
+    fixed = planes(np.stack([o.fixed for o in done]))
     fixed[..., w:] = NOWHERE
+    rows = [rows for o in done for rows in o.rows]
     return Orientations(
         fixed=fixed,
-        firsts=_starts(np.concatenate([p.counts for p in parts])),
-        deltas=np.concatenate([p.deltas for p in parts]),
-        shares=np.concatenate([p.shares for p in parts]),
-        rows=_starts(lengths),
-        targets=np.concatenate(targets).astype(np.int32),
-        starts=_starts(counts),
+        firsts=_starts(np.concatenate([o.parts.counts for o in done])),
+        deltas=np.concatenate([o.parts.deltas for o in done]),
+        shares=np.concatenate([o.parts.shares for o in done]),
+        rows=_starts([len(o.targets) for o in done]),
+        targets=np.concatenate([o.targets for o in done]).astype(np.int32),
+        starts=_starts(np.concatenate([np.diff(r.indptr) for r in rows])),
         row_taps=np.concatenate([r.indices for r in rows]).astype(np.int32),
         row_shares=np.concatenate([r.data for r in rows]).astype(np.float32),
-        nodes=area + 2 * LANES + max(cell_numbers),
+        nodes=h * pitch_of(w) + 2 * LANES + max(o.rows[0].shape[0] for o in done),
     )
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Of one prototype: parts of each vector (h pitch / 16,); deltas (n,); shares (n, 16)."""
+
+    counts: Numbers
+    deltas: I32
+    shares: F32
+
+
+@dataclass(frozen=True)
+class _Oriented:
+    """L_i: fixed (h, w, 2); parts; sparse rows of cells and of holes; which nodes these are."""
+
+    fixed: F32
+    parts: _Parts
+    rows: tuple[Any, Any]
+    targets: Numbers
+
+
+def _orient_one(flow: F32, hole: float) -> _Oriented:
+    h, w, _ = flow.shape
+    first_cell = h * pitch_of(w) + LANES
+    pixels, valid = _splatted(flow, hole)
+    members, through = _filling(valid)
+    cells, holes = members @ pixels, np.flatnonzero(~valid)
+    own = flow.reshape(-1, 2).astype(np.float64)
+    fixed = pixels @ own
+    fixed[holes] = through @ (cells @ own)
+    cells.indices = _padded(cells.indices, w)
+    through.indices += first_cell
+    targets = np.concatenate([first_cell + np.arange(cells.shape[0]), _padded(holes, w)])
+    carried = fixed.reshape(h, w, 2).astype(np.float32)
+    return _Oriented(carried, _parts(pixels, w), (cells, through), targets)
 
 
 def _starts(lengths: Sequence[int] | NDArray[Any]) -> I32:
@@ -125,15 +146,6 @@ def _splatted(flow: F32, hole: float) -> tuple[Any, NDArray[np.bool_]]:
     pixels = sparse.diags(scale) @ splat
     pixels.eliminate_zeros()
     return pixels, valid.reshape(h, w)
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """Of one prototype: parts of each vector (h pitch / 16,); deltas (n,); shares (n, 16)."""
-
-    counts: Numbers
-    deltas: I32
-    shares: F32
 
 
 def _parts(pixels: Any, width: int) -> _Parts:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, I32, check_some_valid
 from mmmgpu.errors import InputError
-from mmmgpu.planes import pictures, planes
+from mmmgpu.planes import picture, planes
 
 FAR = 1e8  # [px] beyond any picture, inside int32
 
@@ -87,11 +87,11 @@ class Reference:
         return Prototypes(images, flows, hole)
 
     def move_prototypes(self, held: Prototypes, flow: F32, used: I32, scale: F32) -> F32:
-        width = held.images.shape[2]
+        to = picture(flow[0], held.images.shape[2])[None]
         moved = np.empty((len(used), *held.images.shape[1:]), np.float32)
         for j, i in enumerate(used):
             own = held.flows[i : i + 1]
-            oriented = self._filled_warp(pictures(flow, width) - own, own, held.hole)
+            oriented = self._filled_warp(to - own, own, held.hole)
             moved[j] = self._filled_warp(held.images[i : i + 1], oriented, held.hole)[0]
         return np.asarray(planes(moved) * scale, np.float32)
 
