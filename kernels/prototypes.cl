@@ -8,84 +8,21 @@
  * Everything is done for 16 neighbours of a row at a time: those of them that move by the same whole
  * number of pixels are neighbours again where they arrive. So pictures are planes, one a channel,
  * and their rows are padded to whole vectors; a padded row is a pitch.
- *
- * Vectors are built from operators alone: PoCL calls its functions of 16 lanes, and inlines none.
  */
 
 #pragma OPENCL FP_CONTRACT OFF
 
-#define FAR 1.0e8f      /* [px] beyond any picture, inside int */
+#include "lanes.cl"
+#include "pyramid.cl"
+
 #define NONE 2147483647 /* where a pixel that arrives nowhere goes */
-#define LANES 16
 #define WHITE 65535.0f  /* the brightest value of a texture */
-#define HUGE 1.0e30f
-
-#define LANE ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
-
-/* A vector anywhere in a plane. */
-typedef float float16u __attribute__((ext_vector_type(16), aligned(4)));
-
-float16 get(__global const float *p)
-{
-    return *(__global const float16u *)p;
-}
-
-void put(__global float *p, const float16 v)
-{
-    *(__global float16u *)p = v;
-}
-
-int pitch_of(const int width)
-{
-    return (width + LANES - 1) / LANES * LANES;
-}
-
-float16 within_reach(const float16 q)
-{
-    const float16 low = q < -FAR ? (float16)(-FAR) : q;
-    return low > FAR ? (float16)FAR : low;
-}
-
-/* floor(q). */
-int16 whole(const float16 q)
-{
-    const int16 n = convert_int16(q);
-    return n + (convert_float16(n) > q);
-}
-
-/* The shares of what arrives within a side of the picture, else 0. */
-float16 inside(const float16 share, const int16 place, const int size)
-{
-    return (place >= 0 & place < size) ? share : (float16)0.0f;
-}
 
 /* Where the vector begins with which each pixel arrives at (x, y). */
 int16 starts_of(const int16 x, const int16 y, const int h, const int w, const int pitch)
 {
     const int16 reaches = x >= -1 & x < w & y >= -1 & y < h;
     return reaches ? y * pitch + x - LANE : (int16)NONE;
-}
-
-int least(const int16 n)
-{
-    const int8 a = n.lo < n.hi ? n.lo : n.hi;
-    const int4 b = a.lo < a.hi ? a.lo : a.hi;
-    const int2 c = b.lo < b.hi ? b.lo : b.hi;
-    return c.x < c.y ? c.x : c.y;
-}
-
-float least_value(const float16 n)
-{
-    const float8 a = n.lo < n.hi ? n.lo : n.hi;
-    const float4 b = a.lo < a.hi ? a.lo : a.hi;
-    const float2 c = b.lo < b.hi ? b.lo : b.hi;
-    return c.x < c.y ? c.x : c.y;
-}
-
-float16 one_later(const float16 v)
-{
-    return (float16)(0.0f, v.s0, v.s1, v.s2, v.s3, v.s4, v.s5, v.s6, v.s7, v.s8, v.s9, v.sa, v.sb,
-                     v.sc, v.sd, v.se);
 }
 
 /* Add one channel of a vector to the two rows on which it arrives. */
@@ -210,12 +147,6 @@ float least_asked(__global const float *weight, const int area, __global const f
     return least_value(low);
 }
 
-/* One over the weight where it is enough, else 0. */
-float16 share_of(const float16 n, const float enough)
-{
-    return n >= enough ? 1.0f / n : (float16)0.0f;
-}
-
 /* From sums to means and a weight of 1, and nothing in holes. */
 void normalise(__global float *total, const int step, const int area, const float hole)
 {
@@ -226,132 +157,6 @@ void normalise(__global float *total, const int step, const int area, const floa
             put(at, share * get(at));
         }
     }
-}
-
-/* Sums of neighbours. */
-float16 pairs(const float16 left, const float16 right)
-{
-    return (float16)(left.even + left.odd, right.even + right.odd);
-}
-
-/* The level after one of h x w: sums over blocks of 2 x 2. Returns the least weight of all. */
-float pull(__global const float *fine, const int step, const int h, const int w,
-           __global float *cells)
-{
-    const int pitch = pitch_of(w);
-    const int columns = (w + 1) / 2;
-    const int across = pitch_of(columns);
-    const int rows = (h + 1) / 2;
-    float16 low = (float16)HUGE;
-    for (int y = 0; y < rows; ++y)
-        for (int x = 0; x < across; x += LANES) {
-            float16 sum = (float16)0.0f;
-            for (int c = 0; c < 4; ++c) {
-                __global const float *from = fine + c * step + 2 * y * pitch + 2 * x;
-                float16 left = get(from);
-                float16 right = (float16)0.0f;
-                if (2 * y + 1 < h)
-                    left += get(from + pitch);
-                if (2 * x + LANES < pitch) {
-                    right = get(from + LANES);
-                    if (2 * y + 1 < h)
-                        right += get(from + pitch + LANES);
-                }
-                sum = pairs(left, right);
-                put(cells + (c * rows + y) * across + x, sum);
-            }
-            low = (x + LANE < columns & sum < low) ? sum : low;
-        }
-    return least_value(low);
-}
-
-float4 mean(__global const float *cells, const int i, const int step)
-{
-    const float share = 1.0f / cells[i + 3 * step];
-    return share * (float4)(cells[i], cells[i + step], cells[i + 2 * step], 0.0f);
-}
-
-/* The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete. */
-float4 between(__global const float *coarse, const int h, const int w, const int y, const int x)
-{
-    const int columns = (w + 1) / 2;
-    const int rows = (h + 1) / 2;
-    const int across = pitch_of(columns);
-    const int step = rows * across;
-    const int x0 = x / 2;
-    const int side = x0 + 2 * (x % 2) - 1;
-    const int x1 = side < 0 ? 0 : side < columns ? side : columns - 1;
-    const int y0 = y / 2 * across;
-    const int above = y / 2 + 2 * (y % 2) - 1;
-    const int y1 = (above < 0 ? 0 : above < rows ? above : rows - 1) * across;
-    const float4 near = 0.75f * mean(coarse, y0 + x0, step) + 0.25f * mean(coarse, y0 + x1, step);
-    const float4 far = 0.75f * mean(coarse, y1 + x0, step) + 0.25f * mean(coarse, y1 + x1, step);
-    return 0.75f * near + 0.25f * far;
-}
-
-/* Give an empty cell a colour, and the weight of one pixel. */
-void set_cell(__global float *cells, const int i, const int step, const float4 colour)
-{
-    cells[i] = colour.x;
-    cells[i + step] = colour.y;
-    cells[i + 2 * step] = colour.z;
-    cells[i + 3 * step] = 1.0f;
-}
-
-/* Push: fill the empty cells of some levels, of which the last has none. */
-void complete(__global float *cells, const int height, const int width, const int levels)
-{
-    for (int up = 1; up < levels; ++up) {
-        int h = height;
-        int w = width;
-        __global float *at = cells;
-        for (int level = 0; level < levels - 1 - up; ++level) {
-            at += 4 * h * pitch_of(w);
-            h = (h + 1) / 2;
-            w = (w + 1) / 2;
-        }
-        const int pitch = pitch_of(w);
-        const int step = h * pitch;
-        for (int y = 0; y < h; ++y)
-            for (int x = 0; x < w; ++x) {
-                const int i = y * pitch + x;
-                if (at[i + 3 * step] == 0.0f)
-                    set_cell(at, i, step, between(at + 4 * step, h, w, y, x));
-            }
-    }
-}
-
-/* Pull-push of means with holes, as far as they are asked for. Returns 0 of nothing but holes.
- *
- * Levels are made until one has no empty cell.
- */
-int fill(__global float *total, const int step, const int height, const int width,
-         __global const float *scale, __global float *cells)
-{
-    int h = (height + 1) / 2;
-    int w = (width + 1) / 2;
-    float low = pull(total, step, height, width, cells);
-    __global float *at = cells;
-    int levels = 1;
-    while (low == 0.0f && (h > 1 || w > 1)) {
-        const int plane = h * pitch_of(w);
-        low = pull(at, plane, h, w, at + 4 * plane);
-        at += 4 * plane;
-        h = (h + 1) / 2;
-        w = (w + 1) / 2;
-        ++levels;
-    }
-    if (low == 0.0f)
-        return 0;
-    complete(cells, (height + 1) / 2, (width + 1) / 2, levels);
-    const int pitch = pitch_of(width);
-    for (int y = 0; y < height; ++y)
-        for (int x = 0; x < width; ++x) {
-            const int i = y * pitch + x;
-            if (total[3 * step + i] == 0.0f && scale[i] > 0.0f)
-                set_cell(total, i, step, between(cells, height, width, y, x));
-        }
-    return 1;
 }
 
 /* Write the means, or add them, and empty the accumulator. */

@@ -11,76 +11,30 @@ their rows are padded to whole vectors; a padded row is a pitch.
 """
 
 import warp as wp
+from mmmgpu.kernels.lanes import (
+    HUGE,
+    LANES,
+    LAST,
+    colours,
+    fraction,
+    get,
+    inside,
+    ivec16,
+    least,
+    one_later,
+    pitch_of,
+    put,
+    share_of,
+    uvec16,
+    vec16,
+    whole,
+)
+from mmmgpu.kernels.pyramid import fill
 
 wp.set_module_options({"enable_backward": False})
 
-FAR = wp.constant(1.0e8)  # [px] beyond any picture, inside int32
 NONE = wp.constant(2147483647)  # where a pixel that arrives nowhere goes
-LANES = 16
-LAST = 15  # lane
-HALF = 8  # lanes
-HUGE = wp.constant(1.0e30)
 WHITE = wp.constant(65535.0)  # the brightest value of a texture
-vec16 = wp.types.vector(length=LANES, dtype=float)
-ivec16 = wp.types.vector(length=LANES, dtype=int)
-uvec16 = wp.types.vector(length=LANES, dtype=wp.uint16)
-
-
-@wp.func
-def get(values: wp.array[float], i: int):
-    """The vector of values i ... i + 15."""
-    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec16)
-    return here[0]
-
-
-@wp.func
-def put(values: wp.array[float], i: int, v: vec16):
-    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec16)
-    here[0] = v
-
-
-@wp.func
-def pitch_of(width: int):
-    return (width + LANES - 1) / LANES * LANES
-
-
-@wp.func
-def colours(texture: uvec16):
-    v = vec16()
-    for j in range(LANES):
-        v[j] = float(texture[j])
-    return v
-
-
-@wp.func
-def within_reach(q: float):
-    return wp.where(q < -FAR, -FAR, wp.where(q > FAR, FAR, q))
-
-
-@wp.func
-def whole(q: vec16):
-    """floor(q)."""
-    n = ivec16()
-    for j in range(LANES):
-        n[j] = int(wp.floor(within_reach(q[j])))
-    return n
-
-
-@wp.func
-def fraction(q: vec16, n: ivec16):
-    f = vec16()
-    for j in range(LANES):
-        f[j] = within_reach(q[j]) - float(n[j])
-    return f
-
-
-@wp.func
-def inside(share: vec16, place: ivec16, size: int):
-    """The shares of what arrives within a side of the picture, else 0."""
-    v = vec16()
-    for j in range(LANES):
-        v[j] = wp.where(wp.uint32(place[j]) < wp.uint32(size), share[j], 0.0)
-    return v
 
 
 @wp.func
@@ -92,14 +46,6 @@ def starts_of(x: ivec16, y: ivec16, h: int, w: int, pitch: int):
         down = wp.uint32(y[j] + 1) <= wp.uint32(h)
         start[j] = wp.where(across and down, y[j] * pitch + x[j] - j, NONE)
     return start
-
-
-@wp.func
-def least(n: ivec16):
-    first = n[0]
-    for j in range(1, LANES):
-        first = wp.min(first, n[j])
-    return first
 
 
 @wp.func
@@ -117,14 +63,6 @@ def others(start: ivec16, here: int):
     for j in range(LANES):
         left[j] = wp.where(start[j] == here, NONE, start[j])
     return left
-
-
-@wp.func
-def one_later(v: vec16):
-    later = vec16()
-    for j in range(LAST):
-        later[j + 1] = v[j]
-    return later
 
 
 @wp.func
@@ -296,15 +234,6 @@ def least_asked(total: wp.array[float], weight: int, area: int, scale: wp.array[
 
 
 @wp.func
-def share_of(n: vec16, least: float):
-    """One over the weight where it is enough, else 0."""
-    share = vec16()
-    for j in range(LANES):
-        share[j] = wp.where(n[j] >= least, 1.0 / n[j], 0.0)
-    return share
-
-
-@wp.func
 def normalise(total: wp.array[float], here: int, step: int, area: int, hole: float):
     """From sums to means and a weight of 1, and nothing in holes."""
     for i in range(0, area, LANES):
@@ -313,136 +242,6 @@ def normalise(total: wp.array[float], here: int, step: int, area: int, hole: flo
         for c in range(4):
             at = here + c * step + i
             put(total, at, wp.cw_mul(share, get(total, at)))
-
-
-@wp.func
-def pairs(left: vec16, right: vec16):
-    """Sums of neighbours."""
-    v = vec16()
-    for j in range(HALF):
-        v[j] = left[2 * j] + left[2 * j + 1]
-        v[j + HALF] = right[2 * j] + right[2 * j + 1]
-    return v
-
-
-@wp.func
-def pull(
-    fine: wp.array[float], finest: int, step: int, h: int, w: int, cells: wp.array[float], to: int
-):
-    """The level after one of h x w: sums over blocks of 2 x 2. Returns the least weight of all."""
-    pitch = pitch_of(w)
-    columns = (w + 1) / 2
-    across = pitch_of(columns)
-    rows = (h + 1) / 2
-    low = vec16(HUGE)
-    for y in range(rows):
-        for x in range(0, across, LANES):
-            sum = vec16()
-            for c in range(4):
-                i = finest + c * step + 2 * y * pitch + 2 * x
-                left = get(fine, i)
-                right = vec16()
-                if 2 * y + 1 < h:
-                    left += get(fine, i + pitch)
-                if 2 * x + LANES < pitch:
-                    right = get(fine, i + LANES)
-                    if 2 * y + 1 < h:
-                        right += get(fine, i + pitch + LANES)
-                sum = pairs(left, right)
-                put(cells, to + (c * rows + y) * across + x, sum)
-            for j in range(LANES):
-                low[j] = wp.where(x + j < columns and sum[j] < low[j], sum[j], low[j])
-    return wp.min(low)
-
-
-@wp.func
-def mean(cells: wp.array[float], i: int, step: int):
-    share = 1.0 / cells[i + 3 * step]
-    return wp.vec3(share * cells[i], share * cells[i + step], share * cells[i + 2 * step])
-
-
-@wp.func
-def between(cells: wp.array[float], coarse: int, h: int, w: int, y: int, x: int):
-    """The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete."""
-    columns = (w + 1) / 2
-    rows = (h + 1) / 2
-    across = pitch_of(columns)
-    step = rows * across
-    x0 = x / 2
-    x1 = wp.clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1)
-    y0 = coarse + y / 2 * across
-    y1 = coarse + wp.clamp(y / 2 + 2 * (y % 2) - 1, 0, rows - 1) * across
-    near = 0.75 * mean(cells, y0 + x0, step) + 0.25 * mean(cells, y0 + x1, step)
-    far = 0.75 * mean(cells, y1 + x0, step) + 0.25 * mean(cells, y1 + x1, step)
-    return 0.75 * near + 0.25 * far
-
-
-@wp.func
-def set_cell(cells: wp.array[float], i: int, step: int, colour: wp.vec3):
-    """Give an empty cell a colour, and the weight of one pixel."""
-    cells[i] = colour[0]
-    cells[i + step] = colour[1]
-    cells[i + 2 * step] = colour[2]
-    cells[i + 3 * step] = 1.0
-
-
-@wp.func
-def complete(cells: wp.array[float], first: int, height: int, width: int, levels: int):
-    """Push: fill the empty cells of `levels` levels, of which the last has none."""
-    for up in range(1, levels):
-        h = int(height)
-        w = int(width)
-        at = int(first)
-        for _ in range(levels - 1 - up):
-            at += 4 * h * pitch_of(w)
-            h = (h + 1) / 2
-            w = (w + 1) / 2
-        pitch = pitch_of(w)
-        step = h * pitch
-        for y in range(h):
-            for x in range(w):
-                i = at + y * pitch + x
-                if cells[i + 3 * step] == 0.0:
-                    set_cell(cells, i, step, between(cells, at + 4 * step, h, w, y, x))
-
-
-@wp.func
-def fill(
-    total: wp.array[float],
-    here: int,
-    step: int,
-    height: int,
-    width: int,
-    scale: wp.array[float],
-    cells: wp.array[float],
-    first: int,
-):
-    """Pull-push of means with holes, as far as they are asked for. Returns 0 of nothing but holes.
-
-    Levels are made until one has no empty cell.
-    """
-    h = int((height + 1) / 2)
-    w = int((width + 1) / 2)
-    low = pull(total, here, step, height, width, cells, first)
-    at = int(first)
-    levels = int(1)
-    while low == 0.0 and (h > 1 or w > 1):
-        plane = h * pitch_of(w)
-        low = pull(cells, at, plane, h, w, cells, at + 4 * plane)
-        at += 4 * plane
-        h = (h + 1) / 2
-        w = (w + 1) / 2
-        levels += 1
-    if low == 0.0:
-        return 0
-    complete(cells, first, (height + 1) / 2, (width + 1) / 2, levels)
-    pitch = pitch_of(width)
-    for y in range(height):
-        for x in range(width):
-            i = y * pitch + x
-            if total[here + 3 * step + i] == 0.0 and scale[i] > 0.0:
-                set_cell(total, here + i, step, between(cells, first, height, width, y, x))
-    return 1
 
 
 @wp.func

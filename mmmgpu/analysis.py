@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from mmmgpu.backends import Backend
+from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import LIP, MOUTH, Basis, around, cut
 from mmmgpu.errors import InputError
 from mmmgpu.flows import Matcher, concatenate, matcher, pull
-from mmmgpu.planes import picture, planes
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]

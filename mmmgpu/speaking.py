@@ -93,8 +93,7 @@ def plan(
     Raises:
         InputError: `articulation` is outside 0.5 to 1.5; the model has no such movement.
     """
-    if not ARTICULATION[0] <= articulation <= ARTICULATION[1]:
-        raise InputError(f"articulation must be between 0.5 and 1.5, got {articulation}")
+    check_articulation(articulation)
     frames = max(1, math.ceil(alignment.duration * float(model.fps) - 1e-6))
     labels = frame_labels(alignment, frames, float(model.fps))
     alpha, beta = (
@@ -102,6 +101,12 @@ def plan(
         for y, neutral in zip(moved_by(model, labels, movement), silent_mouth(model), strict=True)
     )
     return Trajectory(tuple(labels), alpha, focused(project_on_simplex(beta)), model.fps)
+
+
+def check_articulation(factor: float) -> None:
+    """Raise InputError where `factor` is outside 0.5 to 1.5."""
+    if not ARTICULATION[0] <= factor <= ARTICULATION[1]:
+        raise InputError(f"articulation must be between 0.5 and 1.5, got {factor}")
 
 
 def focused(beta: Floats) -> Floats:

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.backends import Backend, get_backend
+from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import Basis, around, cut
-from mmmgpu.planes import picture, planes
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]

@@ -6,8 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
 
 from mmmgpu.backends import get_backend
+from mmmgpu.backends.planes import planes
 from mmmgpu.errors import InputError
-from mmmgpu.planes import planes
 
 HOLE = 0.1
 NUMBER = 3

@@ -4,9 +4,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
 
 from mmmgpu.backends.orientation import orient
+from mmmgpu.backends.planes import LANES, picture, pitch_of
 from mmmgpu.errors import InputError
 from mmmgpu.operations import fill_holes, forward_warp
-from mmmgpu.planes import LANES, picture, pitch_of
 
 HOLE = 0.1
 STAYING = sorted(set(FLOWS) - {"leaving"})

@@ -68,8 +68,8 @@ class Backend(Protocol):
     def move_prototypes(self, held: Any, flow: Any, used: Any, scale: Any, /) -> Any:
         """Some of what `hold_prototypes` gave, each moved along C_syn as in CE05, Eq. 2, scaled.
 
-        (1, 2, H, P), (n,) int32, (H, P) -> (n, 3, H, P), see `mmmgpu.planes`. Where the scale is 0
-        nothing is filled.
+        (1, 2, H, P), (n,) int32, (H, P) -> (n, 3, H, P): planes, see `mmmgpu.backends.planes`.
+        Where the scale is 0 nothing is filled.
         """
 
     def mix_prototypes(self, held: Any, flows: Any, weights: Any, scale: Any, /) -> Any:

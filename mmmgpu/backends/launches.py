@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends.orientation import orient
-from mmmgpu.planes import LANES, pitch_of, planes
+from mmmgpu.backends.planes import LANES, pitch_of, planes
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp

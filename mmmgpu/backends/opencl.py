@@ -6,6 +6,7 @@ sizes are fixed, for PoCL compiles a kernel anew for each.
 
 import functools
 import os
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from mmmgpu.errors import InputError
 
 LOCAL = 16  # work-items of a group; 1 where there are too few to go round
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # PoCL before and after 4.0
+INCLUDED = re.compile(r'^#include "(\w+\.cl)"$', re.MULTILINE)
 NO_CACHE = {"POCL_KERNEL_CACHE": "0"}  # a damaged entry would abort the process
 
 
@@ -129,8 +131,13 @@ def _kernel(context: Any, kernel: str) -> Any:
 @functools.cache
 def _program(context: Any, stem: str) -> Any:
     source = files("mmmgpu.kernels").joinpath(f"{stem}.cl").read_text()
-    program: Any = cl.Program(context, source)
+    program: Any = cl.Program(context, INCLUDED.sub(_included, source))
     return program.build(cache_dir=False)  # nor pyopencl's cache: it has stale locks
+
+
+def _included(line: re.Match[str]) -> str:
+    """The file that an include names: drivers take no folder with a blank in its name."""
+    return files("mmmgpu.kernels").joinpath(line[1]).read_text()
 
 
 def _argument(argument: Any) -> Any:

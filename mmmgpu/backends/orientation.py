@@ -13,7 +13,9 @@ whose pattern is new in every frame.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -22,9 +24,8 @@ from scipy import sparse
 
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends import default_threads
+from mmmgpu.backends.planes import LANES, pitch_of, planes
 from mmmgpu.backends.reference import landings
-from mmmgpu.parallel import Cancelled, map_ordered
-from mmmgpu.planes import LANES, pitch_of, planes
 
 I32 = NDArray[np.int32]
 Numbers = NDArray[np.int64]
@@ -69,11 +70,8 @@ def orient(flows: F32, hole: float) -> Orientations:
         InputError: A flow leaves no pixel in the picture.
     """
     _, h, w, _ = flows.shape
-
-    def one(flow: F32, _: Cancelled) -> _Oriented:
-        return _orient_one(flow, hole)
-
-    done = list(map_ordered(one, flows, threads=default_threads()))
+    with ThreadPoolExecutor(default_threads()) as pool:
+        done = list(pool.map(_orient_one, flows, repeat(hole)))
     fixed = planes(np.stack([o.fixed for o in done]))
     fixed[..., w:] = NOWHERE
     rows = [rows for o in done for rows in o.rows]

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, I32, check_some_valid
+from mmmgpu.backends.planes import picture, planes
 from mmmgpu.errors import InputError
-from mmmgpu.planes import picture, planes
 
 FAR = 1e8  # [px] beyond any picture, inside int32
 
