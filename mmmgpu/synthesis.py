@@ -26,6 +26,7 @@ Floats = NDArray[np.float64]
 HOLE = 0.1  # a pixel that received less than this share of a source pixel is a hole
 NO_TEXTURE = 1e-4  # a smaller beta cannot be seen: half a grey level needs 0.002
 BATCH = 8  # frames of a launch
+BLOCK = 16  # [px] of a cell of hole filling, four levels up
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def prepare_synthesis(
         InputError: A flow of the basis leaves no pixel in the picture.
     """
     shown = np.ones(basis.w_t.shape, bool) if shown is None else shown
-    inside = around(shown)
+    inside = from_whole_blocks(around(shown))
     kernels, part = get_backend(backend), cut(basis, inside)
     scale = planes(shown[inside][..., None].astype(np.float32))[0]
     return Synthesizer(
@@ -73,6 +74,15 @@ def prepare_synthesis(
         inside=inside,
         outside=np.where(shown[..., None], 0, basis.images[basis.reference]),
     )
+
+
+def from_whole_blocks(inside: tuple[slice, slice]) -> tuple[slice, slice]:
+    """`inside`, beginning where a block of the coarser levels of hole filling does.
+
+    So holes are filled from the same pixels as in the whole picture, unless they are very large.
+    """
+    rows, columns = (slice(s.start // BLOCK * BLOCK, s.stop) for s in inside)
+    return rows, columns
 
 
 def synthesize(
