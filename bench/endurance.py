@@ -7,7 +7,7 @@ import numpy as np
 
 from mmmgpu.bench.drawn import drawn_basis, drawn_coordinates
 from mmmgpu.progress import progress
-from mmmgpu.synthesis import synthesize
+from mmmgpu.synthesis import mouths, prepare_synthesis
 
 SAMPLES = 50
 
@@ -18,10 +18,9 @@ def measure_endurance(backends, frames, *, prototypes=8, side=64):
     alpha, beta = drawn_coordinates(prototypes, 64)
     found = {}
     for name in backends:
-        number = np.arange(frames) % 64
-        made = synthesize(
-            basis, (alpha[i] for i in number), (beta[i] for i in number), backend=name
-        )
+        number = np.arange(frames) % len(alpha)
+        given = (alpha[i] for i in number), (beta[i] for i in number)
+        made = mouths(prepare_synthesis(basis, backend=name), *given)
         every, memory, files = max(1, frames // SAMPLES), [], []
         for i, _ in enumerate(progress(made, f"endurance, {name}", total=frames), start=1):
             if i % every == 0:

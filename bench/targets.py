@@ -101,6 +101,7 @@ TARGETS = (
     Target("synthesis [frames/s]", 60, per_second("synthesis")),
     Target("synthesis over the reference", 20, faster_than("synthesis", REFERENCE)),
     Target("synthesis over OpenCV + NumPy", 3, faster_than("synthesis", "opencv + numpy")),
+    Target("mouths [frames/s]", 100, per_second("mouths")),
     Target("analysis [frames/s]", 20, per_second("analysis")),
     Target("GDLR over Eq. 16", 50, faster_than("gdlr", REFERENCE)),
     Target("training over a solve a parameter", 50, faster_than("training", REFERENCE)),

@@ -14,6 +14,13 @@ Picture = NDArray[np.uint8]
 
 MOST_GRAIN = 2.5 / 255  # standard deviation of added grain, at most
 RING = (0.02, 0.6)  # cover in which model and background are compared
+REACH = 3  # [px] beyond the cover, from which cubic interpolation still takes colours
+
+
+def looked_at(cover: F32) -> NDArray[np.bool_]:
+    """The pixels of a region image that a composite with `cover` (h, w) depends on, (h, w)."""
+    around = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    return cv2.dilate((cover > 0).astype(np.uint8), around).astype(bool)
 
 
 def composite(

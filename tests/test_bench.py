@@ -17,7 +17,7 @@ from mmmgpu.bench.comparison import compare_runs
 from mmmgpu.bench.endurance import measure_endurance
 from mmmgpu.bench.kernels import kernel_work
 from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
-from mmmgpu.bench.pictures import analysis_work, synthesis_work
+from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
 from mmmgpu.bench.targets import judge_targets
 from mmmgpu.bench.timing import Contender, Effort, Work, measure, take_turns
 from mmmgpu.errors import InputError
@@ -63,6 +63,7 @@ def test_bytes_are_those_of_the_arguments_and_the_answer(make):
     "work",
     [
         partial(synthesis_work, OURS, ["opencv"], prototypes=4, side=48, frames=2),
+        partial(mouths_work, OURS, prototypes=4, side=48, frames=2),
         partial(analysis_work, OURS, prototypes=6, side=48, frames=2),
         partial(matching_work, OURS, prototypes=4, frames=6, side=32),
         partial(trajectory_work, ["scipy"], seconds=1),

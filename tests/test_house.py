@@ -43,6 +43,7 @@ LAYERS = {
     "mmmgpu.__main__": 3,
 }
 DOMAIN = 2  # every other module
+SHARED = {"mmmgpu.kernels.lanes", "mmmgpu.kernels.pyramid"}  # functions of several kernels
 
 
 def tracked_files():
@@ -89,9 +90,9 @@ def layer(name):
 
 
 def upward(source, name):
-    """What `name` imports from above its layer; for a kernel, all but Warp."""
+    """What `name` imports from above its layer; for a kernel, all but Warp and shared functions."""
     for target in imports(source, name):
-        if layer(name) == 0 and target != "warp":
+        if layer(name) == 0 and target not in {"warp", *SHARED}:
             yield target
         if target.partition(".")[0] == "mmmgpu" and layer(target) > layer(name):
             yield target

@@ -6,6 +6,7 @@ sizes are fixed, for PoCL compiles a kernel anew for each.
 
 import functools
 import os
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,6 +46,7 @@ GONE = {
     cl.status_code.INVALID_CONTEXT,
     cl.status_code.INVALID_DEVICE,
 }
+INCLUDED = re.compile(r'^#include "(\w+\.cl)"$', re.MULTILINE)
 
 
 def open_backend(device: str, threads: int) -> "OpenCL":
@@ -194,7 +196,7 @@ def _kernel(context: Any, kernel: str) -> Any:
 @functools.cache
 def _program(context: Any, stem: str) -> Any:
     source = files("mmmgpu.kernels").joinpath(f"{stem}.cl").read_text()
-    program: Any = cl.Program(context, source)
+    program: Any = cl.Program(context, INCLUDED.sub(_included, source))
     try:
         return program.build(cache_dir=False)  # nor pyopencl's cache: it has stale locks
     except cl.RuntimeError as error:
@@ -204,6 +206,11 @@ def _program(context: Any, stem: str) -> Any:
             f"{context.devices[0].name}: its driver cannot build {stem}.cl ({said}); choose "
             "another device with --backend: mmmgpu info lists those present"
         ) from error
+
+
+def _included(line: re.Match[str]) -> str:
+    """The file that an include names: drivers take no folder with a blank in its name."""
+    return files("mmmgpu.kernels").joinpath(line[1]).read_text()
 
 
 def _argument(argument: Any) -> Any:
