@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.memory import keep_freed_memory
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
 from mmmgpu.errors import InputError
 
@@ -46,6 +47,8 @@ def open_backend(device: str, threads: int) -> "OpenCL":
         raise InputError(f"device 'opencl:{chosen}' has no float64; choose another")
     queue = cl.CommandQueue(cl.Context([found]))
     on_cpu = bool(found.type & cl.device_type.CPU)
+    if on_cpu:
+        keep_freed_memory()
     return OpenCL(found.max_compute_units if on_cpu else GPU_WORKERS, queue)
 
 
@@ -91,8 +94,11 @@ class OpenCL(Launches):
         return cl.array.Array(self.queue, array.shape, array.dtype, data=data)
 
     def to_host(self, array: Any) -> F32:
-        host: F32 = array.get()
-        return host
+        if not array.size:
+            return np.empty(array.shape, array.dtype)
+        flags, shape = cl.map_flags.READ, array.shape
+        host, _ = cl.enqueue_map_buffer(self.queue, array.data, flags, 0, shape, array.dtype)
+        return np.asarray(host)
 
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
         return cl.array.empty(self.queue, shape, dtype)
