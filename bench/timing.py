@@ -14,6 +14,7 @@ import numpy as np
 from mmmgpu.errors import InputError
 
 REFERENCE = "reference"
+PAUSE = 0.03  # s
 SLOW = 1.0  # s: what takes longer has one turn only
 
 
@@ -137,7 +138,8 @@ def take_turns(runs, effort):
 
 
 def timed(run):
-    """Seconds of one run."""
+    """Seconds of one run, after a pause: the threads of the library before may still spin."""
+    time.sleep(PAUSE)
     start = time.perf_counter()
     run()
     return time.perf_counter() - start

@@ -52,7 +52,8 @@ class Analyzer:
 
     basis: cut to the rectangle `inside` in which the masks are not zero.
     kernels, held: the backend, and the prototypes on it.
-    pixels: indices of the n reference pixels with w_f above 0.02; weight (n,): w_f there.
+    pixels: indices of n reference pixels, every second of those with w_f above 0.02; weight (n,):
+        w_f there.
     along: the prototype flows there, x above y, (2 n, M - 1).
     gram: Cholesky factor of the regularised Gram matrix of the flows.
     everywhere: sqrt(w_t), but not below 0.01: what a step needs to see, (h, pitch).
@@ -82,7 +83,7 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
     """
     inside = around((basis.w_t > MOUTH) | (basis.w_f > LIP))
     basis = cut(basis, inside)
-    pixels = np.flatnonzero(basis.w_f > LIP)
+    pixels = np.flatnonzero((basis.w_f > LIP) & chessboard(basis.w_f.shape))
     weight = basis.w_f.ravel()[pixels]
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
     along = np.ascontiguousarray(moving.transpose(2, 1, 0).reshape(2 * len(pixels), -1))
@@ -111,6 +112,12 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
     )
 
 
+def chessboard(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Every second pixel of a picture (h, w): neighbours say nearly the same of a flow."""
+    y, x = np.indices(shape)
+    return np.asarray((x + y) % 2 == 0)
+
+
 def byte_thumbnail(image: F32, mask: F32) -> NDArray[np.uint8]:
     """`thumbnail` of a picture in [0, 1] in whole grey levels: what is kept of every frame."""
     return np.round(thumbnail(image, mask) * 255).astype(np.uint8)
@@ -127,19 +134,20 @@ def thumbnail(image: F32, mask: F32) -> F32:
 def analyze(analyzer: Analyzer, image: F32) -> tuple[Floats, Floats]:
     """(alpha (M - 1,), beta (M,)) of a region `image`, (h, w, 3) in [0, 1]."""
     image = np.ascontiguousarray(image[analyzer.inside])
+    wanted = planes(image)
     small = thumbnail(image, analyzer.basis.w_t)
     order = np.argsort(((analyzer.thumbnails - small) ** 2).sum(axis=1))
     alpha = fit_flow(analyzer, _flow_to(analyzer, image, int(order[0])))
     used = np.sort(order[:NEAREST])
     for _ in range(STEPS):
         flow = analyzer.basis.flow(alpha)
-        beta, made = _fit_texture(analyzer, image, flow, used)
+        beta, made = _fit_texture(analyzer, wanted, flow, used)
         alpha = _refine(analyzer, image, alpha, flow, made)
         used = np.flatnonzero(beta > NO_TEXTURE)
     every = np.arange(len(analyzer.thumbnails))
     flow = analyzer.basis.flow(alpha)
     warped = _warped(analyzer, flow, every, analyzer.masked)
-    return alpha, _fit_beta(analyzer, image, warped, every, analyzer.masked)
+    return alpha, _fit_beta(analyzer, wanted, warped, every, analyzer.masked)
 
 
 def _flow_to(analyzer: Analyzer, image: F32, nearest: int) -> F32:
@@ -212,14 +220,14 @@ def _pulled(analyzer: Analyzer, field: F32, flow: F32) -> F32:
 
 
 def _fit_texture(
-    analyzer: Analyzer, image: F32, flow: F32, used: NDArray[np.int64]
+    analyzer: Analyzer, wanted: F32, flow: F32, used: NDArray[np.int64]
 ) -> tuple[Floats, F32]:
-    """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3)."""
+    """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3); `wanted` as planes."""
     scale = analyzer.everywhere
     warped = _warped(analyzer, flow, used, scale)
-    beta = _fit_beta(analyzer, image, warped, used, scale)
-    mixed = (beta[used].astype(np.float32) @ warped).reshape(3, *scale.shape)
-    width = image.shape[1]
+    beta = _fit_beta(analyzer, wanted, warped, used, scale)
+    mixed = (beta[used].astype(np.float32) @ warped).reshape(wanted.shape)
+    width = flow.shape[1]
     return beta, picture(mixed[..., :width] / scale[:, :width], width)
 
 
@@ -232,12 +240,12 @@ def _warped(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: F32) 
 
 
 def _fit_beta(
-    analyzer: Analyzer, image: F32, warped: F32, used: NDArray[np.int64], scale: F32
+    analyzer: Analyzer, wanted: F32, warped: F32, used: NDArray[np.int64], scale: F32
 ) -> Floats:
     """beta (M,), zero outside `used`; warped: what `_warped` gives for `scale`."""
-    wanted = (planes(image) * scale).ravel()
+    scaled = (wanted * scale).ravel()
     beta = np.zeros(len(analyzer.thumbnails))
-    beta[used] = solve_simplex(warped @ warped.T, warped @ wanted)
+    beta[used] = solve_simplex(warped @ warped.T, warped @ scaled)
     return beta
 
 

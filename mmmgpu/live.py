@@ -33,6 +33,8 @@ def live(
 ) -> Iterator[Picture]:
     """Yield a frame (H, W, 3) RGB for each label, on the model's own background.
 
+    Frames are quickest within `mmmgpu.parallel.one_thread_each`: each is small.
+
     Args:
         model: A trained model.
         labels: The phone of every frame at `model.fps`; they may have no end. In place of one that

@@ -18,6 +18,7 @@ from mmmgpu.analysis import (
 from mmmgpu.analysis import _fit_texture as fit_texture
 from mmmgpu.analysis import _refine as refine
 from mmmgpu.backends import get_backend
+from mmmgpu.backends.planes import planes
 from mmmgpu.errors import InputError
 from mmmgpu.synthesis import synthesize
 
@@ -126,7 +127,7 @@ def test_alpha_is_the_ridge_regression_of_the_flow(basis, analyzer):
     for y in range(h):
         for x in range(w):
             weight = analyzer.basis.w_f[y, x]
-            if weight > 0.02:
+            if weight > 0.02 and (x + y) % 2 == 0:
                 for c in range(2):
                     own = analyzer.basis.flows[analyzer.basis.moving, y, x, c]
                     rows.append(np.sqrt(weight) * own.astype(float))
@@ -218,7 +219,7 @@ def test_a_step_lowers_the_difference_of_the_pictures(basis, analyzer, kernels, 
     everything = np.arange(5)
 
     def error(a):
-        _, made = fit_texture(analyzer, image, analyzer.basis.flow(a), everything)
+        _, made = fit_texture(analyzer, planes(image), analyzer.basis.flow(a), everything)
         return -psnr(made, image, analyzer.basis.w_f), made
 
     before, made = error(start)

@@ -4,13 +4,11 @@ A Warp launch on the CPU is one serial loop that releases the GIL, so the items 
 cut into one contiguous part a thread. No two parts ever write to one place.
 """
 
-import ctypes
 import functools
 import importlib
 import itertools
 import os
 import shutil
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -25,11 +23,11 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.memory import keep_freed_memory
 from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
 
 NO_MEMORY = "Failed to allocate"  # what Warp says
 GONE = "CUDA error", "Failed to synchronize"
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 
 def open_backend(device: str, threads: int) -> "Warp":
@@ -41,7 +39,7 @@ def open_backend(device: str, threads: int) -> "Warp":
         present = ", ".join(f"warp:{d.alias}" for d in wp.get_devices())
         raise InputError(f"there is no device 'warp:{device}'; present: {present}") from None
     if found.is_cpu:
-        _keep_freed_memory()
+        keep_freed_memory()
         return Warp(workers=threads, device="cpu", threads=threads)
     return Warp(workers=GPU_WORKERS, device=found.alias, threads=1)
 
@@ -64,18 +62,6 @@ def _start() -> None:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nothing)
-
-
-def _keep_freed_memory() -> None:
-    """Let the C library reuse large blocks, for Warp has no memory pool on the CPU.
-
-    Otherwise the arrays of every frame are fresh pages, a quarter of a frame's time. Blocks above
-    32 MiB still go back at once, and so does what is free beyond 256 MiB.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
-        mallopt(M_MMAP_THRESHOLD, 32 << 20)
-        mallopt(M_TRIM_THRESHOLD, 256 << 20)
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32
 from mmmgpu.backends import default_threads
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.memory import keep_freed_memory
 from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
 from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
@@ -62,6 +63,8 @@ def open_backend(device: str, threads: int) -> "OpenCL":
         raise InputError(f"device 'opencl:{chosen}' has no float64; choose another")
     queue = cl.CommandQueue(cl.Context([found]))
     on_cpu = bool(found.type & cl.device_type.CPU)
+    if on_cpu:
+        keep_freed_memory()
     workers = found.max_compute_units if on_cpu else GPU_WORKERS
     return OpenCL(workers, f"opencl:{chosen}", queue)
 
@@ -152,9 +155,12 @@ class OpenCL(Launches):
         return cl.array.Array(self.queue, array.shape, array.dtype, data=data)
 
     def to_host(self, array: Any) -> F32:
+        if not array.size:
+            return np.empty(array.shape, array.dtype)
+        flags, shape = cl.map_flags.READ, array.shape
         with _faults_of(self.name):
-            host: F32 = array.get()
-        return host
+            host, _ = cl.enqueue_map_buffer(self.queue, array.data, flags, 0, shape, array.dtype)
+        return np.asarray(host)
 
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
         with _faults_of(self.name):

@@ -59,6 +59,7 @@ def live(
     from mmmgpu.live import live as frames_of
     from mmmgpu.model_files import load
     from mmmgpu.models import labels_known
+    from mmmgpu.parallel import one_thread_each
     from mmmgpu.video_writing import write_video
 
     get_backend(backend)
@@ -67,13 +68,14 @@ def live(
     frames = frames_of(
         person, labels, movement=movement, articulation=articulation, backend=backend
     )
-    if out is not None:
-        write_video(out, frames, fps=person.fps, lossless=lossless)
-        return
-    _announce(person)
-    for frame in frames:
-        sys.stdout.buffer.write(frame.tobytes())
-        sys.stdout.buffer.flush()
+    with one_thread_each():
+        if out is not None:
+            write_video(out, frames, fps=person.fps, lossless=lossless)
+            return
+        _announce(person)
+        for frame in frames:
+            sys.stdout.buffer.write(frame.tobytes())
+            sys.stdout.buffer.flush()
 
 
 def _announce(model: "Model") -> None:
