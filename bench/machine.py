@@ -51,6 +51,7 @@ def commit():
         return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
+        git("ls-files", "--error-unmatch", __file__)  # it may be installed below another project
         return git("rev-parse", "--short=12", "HEAD") + "+" * bool(git("status", "--short", "-uno"))
     except (OSError, subprocess.CalledProcessError):
         return None

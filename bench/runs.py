@@ -17,6 +17,7 @@ from mmmgpu.bench.targets import judge_targets
 from mmmgpu.bench.timing import QUICK, Effort, measure
 from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
+from mmmgpu.voices import is_installed
 
 VERSION = 1  # of the record
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
@@ -69,8 +70,10 @@ def run_benchmarks(plan):
         results["threads"] = measure_threads(plan.backends, rounds=1 if plan.quick else 2)
     if "startup" in parts:
         results["startup"] = measure_startup(plan.backends)
-    if "pipeline" in parts:
+    if "pipeline" in parts and is_installed():
         results["pipeline"] = measure_pipeline(plan.backends[0])
+    elif "pipeline" in parts:
+        absent.append("a voice for the pipeline (mmmgpu[tts])")
     if plan.endurance:
         results["endurance"] = measure_endurance(plan.backends, plan.endurance)
     after = measure_machine()

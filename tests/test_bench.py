@@ -1,6 +1,7 @@
 """The benchmarks: right answers before times, honest counts, and what a comparison calls slower."""
 
 import json
+import subprocess
 import sys
 import threading
 import time
@@ -11,7 +12,7 @@ import pytest
 from commands import assert_refused, run_command
 
 from mmmgpu.backends import BACKENDS
-from mmmgpu.bench import cases, growth, machine, peers, pipeline, startup
+from mmmgpu.bench import cases, growth, machine, peers, pipeline, runs, startup
 from mmmgpu.bench.charts import draw_growth
 from mmmgpu.bench.comparison import compare_runs
 from mmmgpu.bench.endurance import measure_endurance
@@ -243,6 +244,22 @@ def test_the_command_writes_a_record_and_compares_it(tmp_path, capfd, monkeypatc
     ended = mmmgpu("bench", "compare", out, out)
     assert ended.status == 0
     assert "drift of the machine 1" in ended.out
+
+
+def test_a_pipeline_without_a_voice_is_said_and_left_out(monkeypatch):
+    monkeypatch.setattr(runs, "is_installed", lambda: False)
+    monkeypatch.setattr(machine, "COPIED", 1 << 20)
+    found = runs.run_benchmarks(runs.Plan(parts=["pipeline"]))
+    assert "pipeline" not in found
+    assert found["absent"] == ["a voice for the pipeline (mmmgpu[tts])"]
+
+
+def test_the_commit_is_not_that_of_another_project_around(monkeypatch, tmp_path):
+    author = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for call in (["init", "-q"], [*author, "commit", "-q", "--allow-empty", "-m", "other"]):
+        subprocess.run(["git", "-C", tmp_path, *call], check=True, capture_output=True)
+    monkeypatch.setattr(machine, "__file__", str(tmp_path / "machine.py"))
+    assert machine.commit() is None
 
 
 @pytest.mark.parametrize(
