@@ -11,6 +11,12 @@ wp.set_module_options({"enable_backward": False})
 RUN = 16
 
 
+@wp.func
+def within(x: float, most: float):
+    """0 ... most; wp.clamp minds NaN."""
+    return wp.where(x < 0.0, 0.0, wp.where(x > most, most, x))
+
+
 @wp.kernel
 def sample(
     field: wp.array[float],  # (fields, H, W, C), fields is 1 or the batch
@@ -37,8 +43,8 @@ def sample(
     bottom = float(height - 1)
     for p in range(start, wp.min(start + RUN, number)):
         point = points[(b % sets) * number + p]
-        x = wp.clamp(point[0], 0.0, right)
-        y = wp.clamp(point[1], 0.0, bottom)
+        x = within(point[0], right)
+        y = within(point[1], bottom)
         x0 = int(x)
         y0 = int(y)
         fx = x - float(x0)
@@ -77,8 +83,8 @@ def sample_pictures(
     bottom = float(height - 1)
     for p in range(start, wp.min(start + RUN, number)):
         point = points[(b % sets) * number + p]
-        x = wp.clamp(point[0], 0.0, right)
-        y = wp.clamp(point[1], 0.0, bottom)
+        x = within(point[0], right)
+        y = within(point[1], bottom)
         x0 = int(x)
         y0 = int(y)
         fx = x - float(x0)
