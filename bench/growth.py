@@ -58,7 +58,7 @@ def grown(axis, name):
     runs = [make(name, size) for size in sizes]
     for run in runs:
         run()
-    best = np.min([[timed(run) for run in runs] for _ in range(TURNS)], axis=0)
+    best = np.min([[timed(run)[0] for run in runs] for _ in range(TURNS)], axis=0)
     counts = [count(size) for size in sizes]
     exponent = float(np.polyfit(np.log(counts), np.log(best), 1)[0])
     ms = [float(f"{1e3 * t:.4g}") for t in best]

@@ -2,7 +2,7 @@
 
 from mmmgpu.bench.timing import REFERENCE
 
-WORKS = f"{'':32}  median ms          quartiles  x ref  x peer    bytes    flops"
+WORKS = f"{'':32}  median ms          quartiles   cpu ms  x ref  x peer    bytes    flops"
 WORKS += "    first transfer  differs"
 OURS = ("warp", "opencl", "ours", "adjoint")
 
@@ -10,6 +10,7 @@ OURS = ("warp", "opencl", "ours", "adjoint")
 def work_tables(results):
     """For each work its name, and a line for each contender under the heading `WORKS`.
 
+    cpu: of all threads, the least of all runs; threads that spin count.
     x ref, x peer: how many times faster than the reference, and than the best other library.
     bytes, flops: shares of the copy bandwidth and of the arithmetic peak. first, transfer: [ms].
     differs: from the reference, as a share of its scale.
@@ -27,7 +28,8 @@ def line(who, row, slow, best, work):
     ms = row["median_ms"]
     low, high = row["quartiles_ms"]
     beside = f"{best / ms:.2f}" if best and who.partition(":")[0] in OURS else ""
-    said = f"  {who:30}{ms:11.4g}{low:9.4g} .. {high:<6.4g}{slow / ms:6.3g}{beside:>8}"
+    said = f"  {who:30}{ms:11.4g}{low:9.4g} .. {high:<6.4g}"
+    said += f"{row['cpu_ms']:9.4g}{slow / ms:7.3g}{beside:>8}"
     said += f"{percent(row.get('bandwidth')):>9}{percent(row.get('arithmetic')):>9}"
     if "first_ms" in row:
         said += f"{row['first_ms']:9.3g}{row['transfer_ms']:9.3g}{row['difference']:9.0e}"

@@ -72,15 +72,16 @@ def measure(work, effort):
     Raises:
         InputError: An answer differs from the reference by more than its tolerance.
     """
-    start = time.perf_counter()
+    start = time.perf_counter(), time.process_time()
     desired = as_tuple(work.reference())
-    slow = (time.perf_counter() - start) / work.part
+    slow = (time.perf_counter() - start[0]) / work.part
+    processor = (time.process_time() - start[1]) / work.part
     runs, found = {}, {}
     for name, contender in work.contenders.items():
         runs[name], found[name] = validated(work.name, name, contender, desired)
     seconds = take_turns(runs, effort)
-    rows = {name: statistics(s) | found[name] for name, s in seconds.items()}
-    rows[REFERENCE] = statistics(np.array([slow]))
+    rows = {name: statistics(*s) | found[name] for name, s in seconds.items()}
+    rows[REFERENCE] = statistics(np.array([slow]), np.array([processor]))
     size = {"bytes": work.bytes, "operations": work.operations}
     return {"items": work.items, "unit": work.unit, **size, "contenders": rows}
 
@@ -122,36 +123,38 @@ def difference(actual, desired):
 
 
 def take_turns(runs, effort):
-    """Seconds of every run of each of `runs`, which take turns after one that is not counted."""
-    seconds, warm = {}, {}
-    for name, run in runs.items():
-        warm[name] = timed(run)
-        seconds[name] = [warm[name]] if warm[name] > SLOW else []
-    quick = [name for name in runs if warm[name] <= SLOW]
+    """Seconds of every run of each of `runs`, and of the processor for it; after one to warm up."""
+    warm = {name: timed(run) for name, run in runs.items()}
+    seconds = {name: [once] if once[0] > SLOW else [] for name, once in warm.items()}
+    quick = [name for name in runs if not seconds[name]]
     begin = time.perf_counter()
     for turn in range(effort.most):
         if turn >= effort.turns and time.perf_counter() - begin > effort.seconds:
             break
         for name in quick:
             seconds[name].append(timed(runs[name]))
-    return {name: np.array(s) for name, s in seconds.items()}
+    return {name: np.array(s).T for name, s in seconds.items()}
 
 
 def timed(run):
-    """Seconds of one run, after a pause: the threads of the library before may still spin."""
+    """Seconds of one run, and of the processor for it, all threads.
+
+    After a pause, for the threads of the library before may still spin.
+    """
     time.sleep(PAUSE)
-    start = time.perf_counter()
+    start, processor = time.perf_counter(), time.process_time()
     run()
-    return time.perf_counter() - start
+    return time.perf_counter() - start, time.process_time() - processor
 
 
-def statistics(seconds):
-    """Median, quartiles and best [ms]."""
+def statistics(seconds, processor):
+    """Median, quartiles and best [ms]; the least of the processor, which other work slows least."""
     low, median, high = np.percentile(seconds, [25, 50, 75])
     return {
         "median_ms": milliseconds(median),
         "quartiles_ms": [milliseconds(low), milliseconds(high)],
         "best_ms": milliseconds(seconds.min()),
+        "cpu_ms": milliseconds(processor.min()),
         "turns": len(seconds),
     }
 

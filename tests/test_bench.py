@@ -100,7 +100,25 @@ def test_contenders_take_turns():
     runs = {name: partial(order.append, name) for name in "ab"}
     seconds = take_turns(runs, Effort(turns=3, seconds=0.0))
     assert order == list("ab" * 4)  # the first round is not counted
-    assert [len(s) for s in seconds.values()] == [3, 3]
+    assert [s.shape for s in seconds.values()] == [(2, 3), (2, 3)]
+
+
+def test_the_processor_s_time_is_that_of_all_threads():
+    def spin():
+        end = time.thread_time() + 0.05
+        while time.thread_time() < end:
+            pass
+
+    def three():
+        threads = [threading.Thread(target=spin) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return np.ones(1)
+
+    work = Work("w", lambda: np.ones(1), {"a": Contender(lambda: three)})
+    assert measure(work, ONCE)["contenders"]["a"]["cpu_ms"] > 149
 
 
 def test_the_reference_s_part_counts_for_the_whole():
@@ -172,7 +190,7 @@ def test_a_target_is_met_or_not_by_the_best_backend():
 def test_the_exponent_of_growth_is_that_of_the_power_law(monkeypatch, power):
     axis = (2, 4, 8), lambda name, n: lambda: n, int
     monkeypatch.setitem(growth.AXES, "pages", axis)
-    monkeypatch.setattr(growth, "timed", lambda run: 0.1 * run() ** power)
+    monkeypatch.setattr(growth, "timed", lambda run: (0.1 * run() ** power, 0))
     assert growth.grown("pages", "warp")["exponent"] == pytest.approx(power)
 
 
