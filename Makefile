@@ -4,7 +4,7 @@
 #   make test                  all tests; more for pytest: make test PYTEST_ARGS='-k flows -x'
 #   make lint                  style, format and types
 #   make demo                  learn a drawn face and let it speak: see demo/report.html
-#   make bench                 kernels against the reference and numba
+#   make bench                 how fast this machine does the work: BENCH_ARGS=--peers
 #   make clean                 remove .venv and all that was made; your own files stay
 #
 # Another Python: make install PYTHON=/path/to/python

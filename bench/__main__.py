@@ -1,5 +1,8 @@
+"""``python -m bench``: the same as ``mmmgpu bench``."""
+
 import sys
 
-from bench.kernels import main
+from mmmgpu.cli import main
 
-main(sys.argv[1:])
+sys.argv.insert(1, "bench")
+main()

@@ -37,6 +37,7 @@ def summary(errors):
 
 
 def main(arguments):
+    """Print and write how far the boundaries are apart."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("aligned", type=Path, help="folder of the TextGrids to be judged")
     parser.add_argument("truth", type=Path, help="folder of the alignments to judge by")

@@ -1,6 +1,9 @@
-"""What is measured: made-up but lifelike inputs, by name."""
+"""The operations on made-up but lifelike arrays: what is measured of the kernels, as data.
 
-from collections.abc import Callable
+Bytes are those that must be read and written once; operations are additions, products, roots,
+divisions and exponentials, each counted as one.
+"""
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,13 +11,27 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Case:
-    """One operation on one set of arrays; `arrays` are the device arguments in order."""
+    """One operation on one set of arrays.
+
+    operation: a method of `mmmgpu.backends.Backend`, and a function of the peers.
+    arrays, scalars: its arguments in order.
+    answer: values of what it returns.
+    operations: that it does at least.
+    checked: items of the first array that the reference works on, where all would take minutes.
+    """
 
     name: str
     operation: str
     arrays: tuple[np.ndarray, ...]
+    answer: int
+    operations: int
     scalars: tuple[float, ...] = ()
-    peer: str | None = None  # a function of bench.peers
+    checked: int | None = None
+
+    @property
+    def bytes(self):
+        """Read and written once."""
+        return sum(a.nbytes for a in self.arrays) + 4 * self.answer
 
 
 def smooth_flow(rng, batch, height, width):
@@ -27,42 +44,85 @@ def smooth_flow(rng, batch, height, width):
 
 
 def splat(rng, batch=50, height=256, width=256, channels=4):
+    """Each value times four weights, added; then a division."""
     field = rng.random((batch, height, width, channels), dtype=np.float32)
-    arrays = field, smooth_flow(rng, batch, height, width)
-    return Case("forward_warp 50x256x256x4", "forward_warp", arrays, peer="forward_warp")
+    pixels = batch * height * width
+    return Case(
+        f"forward_warp {batch}x{height}x{width}x{channels}",
+        "forward_warp",
+        (field, smooth_flow(rng, batch, height, width)),
+        answer=pixels * (channels + 1),
+        operations=pixels * (8 * (channels + 1) + channels + 8),
+    )
 
 
 def fill(rng, batch=46, height=160, width=192):
+    """One pixel in fifty is a hole. Nearly all that must be done is to copy and to average once."""
     field = rng.random((batch, height, width, 3), dtype=np.float32)
     weight = (rng.random((batch, height, width)) > 0.02).astype(np.float32)
-    return Case("fill_holes 46x160x192x3", "fill_holes", (field, weight), (0.5,))
+    size = batch * height * width
+    name = f"fill_holes {batch}x{height}x{width}x3"
+    return Case(name, "fill_holes", (field, weight), 3 * size, 8 * size, (0.5,))
 
 
 def blend(rng, number=46, height=160, width=192):
+    """One weighted sum."""
     images = rng.random((number, height, width, 3), dtype=np.float32)
-    return Case("blend 46x160x192x3", "blend", (images, rng.random((1, number), np.float32)))
+    weights = rng.dirichlet(np.ones(number), 1).astype(np.float32)
+    name, size = f"blend {number}x{height}x{width}x3", 3 * height * width
+    return Case(name, "blend", (images, weights), size, 2 * number * size)
 
 
 def sample(rng, height=480, width=640):
+    """Backward warping of a picture along a smooth flow, as of one frame."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    points = (np.stack([x, y], -1) + smooth_flow(rng, 1, height, width)[0]).reshape(1, -1, 2)
+    return gather(rng, height, width, points, "a warp")
+
+
+def sample_at_random(rng, height=480, width=640):
+    """The same at points without any order, for which caches do not help."""
+    points = rng.uniform(0, [width - 1, height - 1], (1, height * width, 2)).astype(np.float32)
+    return gather(rng, height, width, points, "at random")
+
+
+def gather(rng, height, width, points, kind):
+    """`sample` of a picture at as many points."""
     field = rng.random((1, height, width, 3), dtype=np.float32)
-    points = rng.uniform(0, [width, height], (1, height * width, 2)).astype(np.float32)
-    return Case("sample 640x480x3 at random", "sample", (field, points))
+    name, size = f"sample {width}x{height}x3, {kind}", height * width
+    arrays = field, np.ascontiguousarray(points)
+    return Case(name, "sample", arrays, answer=3 * size, operations=size * (4 + 3 * 9))
 
 
 def scan(rng, queries=50, corpus=450, points=16384):
+    """For each pair and point two differences and squares, two sums, a root and a product."""
     arrays = tuple(rng.random((n, points, 2), dtype=np.float32) for n in (queries, corpus))
     weights = rng.random(points, dtype=np.float32)
-    name = "distance_scan 50x450x16384x2"
-    return Case(name, "distance_scan", (*arrays, weights), peer="distance_scan")
+    name = f"distance_scan {queries}x{corpus}x{points}x2"
+    work = queries * corpus * points * 8
+    return Case(name, "distance_scan", (*arrays, weights), queries * corpus, work, checked=1)
 
 
 def rbf(rng, height=256, width=256, number=38):
+    """A map like those between two faces: points apart from each other, weights that cancel."""
     y, x = np.mgrid[:height, :width]
-    centres = rng.uniform(0, [width, height], (number, 2))
+    across = int(np.ceil(np.sqrt(number)))
+    cells = rng.permutation(across * across)[:number]
+    place = (np.stack([cells % across, cells // across], -1) + 0.5) / across
+    centres = (place + rng.uniform(-0.3, 0.3, place.shape) / across) * [width, height]
+    plane = np.linalg.qr(np.column_stack([np.ones(number), centres]))[0]
+    weights = rng.normal(0, 5, (number, 2))
+    weights -= plane @ (plane.T @ weights)  # the side conditions of an interpolant
     affine = np.array([[20, 1.2, 0.1], [-10, -0.1, 1.3]])
-    arrays = np.stack([x, y], -1).reshape(-1, 2), centres, rng.normal(0, 5, (number, 2)), affine
-    name = "evaluate_rbf 256x256, 38 points"
-    return Case(name, "evaluate_rbf", tuple(a.astype(np.float32) for a in arrays), (0.003,))
+    arrays = np.stack([x, y], -1).reshape(-1, 2), centres, weights, affine
+    return Case(
+        f"evaluate_rbf {width}x{height}, {number} points",
+        "evaluate_rbf",
+        tuple(a.astype(np.float32) for a in arrays),
+        answer=2 * height * width,
+        operations=height * width * (number * 11 + 8),
+        scalars=(0.001,),
+    )
 
 
 def piecewise(rng, height=288, width=360, batch=16, across=8):
@@ -77,34 +137,13 @@ def piecewise(rng, height=288, width=360, batch=16, across=8):
     triangles = np.concatenate([upper, lower]).astype(np.int32)
     index = np.repeat(np.arange(len(triangles)), 47).astype(np.int32)
     barycentric = rng.dirichlet(np.ones(3), len(index)).astype(np.float32)
-    arrays = field, vertices, triangles, index, barycentric
-    return Case("piecewise_warp 16 x 4606 pixels", "piecewise_warp", arrays)
+    return Case(
+        f"piecewise_warp {batch}x{len(index)} pixels",
+        "piecewise_warp",
+        (field, vertices, triangles, index, barycentric),
+        answer=batch * len(index) * 3,
+        operations=batch * len(index) * (10 + 4 + 3 * 9),
+    )
 
 
-CASES: list[Callable[[np.random.Generator], Case]] = [
-    splat,
-    fill,
-    blend,
-    sample,
-    scan,
-    rbf,
-    piecewise,
-]
-
-
-@dataclass(frozen=True)
-class Chain:
-    """One frame of synthesis: flows re-oriented, images warped, holes filled, all blended."""
-
-    residual: np.ndarray  # (M, H, W, 2) [px]
-    flows: np.ndarray  # (M, H, W, 2) [px]
-    images: np.ndarray  # (M, H, W, 3)
-    weights: np.ndarray  # (1, M)
-
-
-def chain(rng, number=46, height=160, width=192):
-    flows = smooth_flow(rng, number, height, width)
-    weights = rng.dirichlet(np.ones(number))[None].astype(np.float32)
-    residual = np.tensordot(weights[0], flows, axes=1) - flows
-    images = rng.random((number, height, width, 3), dtype=np.float32)
-    return Chain(residual, flows, images, weights)
+CASES = (splat, fill, blend, sample, sample_at_random, scan, rbf, piecewise)

@@ -6,6 +6,7 @@
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
 #define LANES 16
+#define BLOCK 8 /* terms summed in float */
 
 __kernel void blend(
     __global const float *images,   /* (M, S) */
@@ -24,11 +25,19 @@ __kernel void blend(
     const int b = (first + tid) / vectors;
     const int start = (first + tid) % vectors * LANES;
     double4 total[LANES / 4] = {(double4)(0.0), (double4)(0.0), (double4)(0.0), (double4)(0.0)};
-    for (int m = 0; m < number; ++m) {
-        const double w = weights[b * number + m];
-        if (w != 0.0)
-            for (int lane = 0; lane < LANES / 4; ++lane)
-                total[lane] += w * convert_double4(vload4(lane, images + m * size + start));
+    for (int begin = 0; begin < number; begin += BLOCK) {
+        float8 part[2] = {(float8)(0.0f), (float8)(0.0f)};
+        for (int m = begin; m < min(begin + BLOCK, number); ++m) {
+            const float w = weights[b * number + m];
+            if (w != 0.0f) {
+                part[0] += w * vload8(0, images + m * size + start);
+                part[1] += w * vload8(1, images + m * size + start);
+            }
+        }
+        total[0] += convert_double4(part[0].lo);
+        total[1] += convert_double4(part[0].hi);
+        total[2] += convert_double4(part[1].lo);
+        total[3] += convert_double4(part[1].hi);
     }
     for (int lane = 0; lane < LANES / 4; ++lane)
         vstore4(convert_float4(total[lane]), lane, blended + b * size + start);

@@ -5,6 +5,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 LANES = 16
+BLOCK = wp.constant(8)  # terms summed in float32
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16d = wp.types.vector(length=LANES, dtype=wp.float64)
 
@@ -27,10 +28,13 @@ def blend(
     b = (first + tid) / vectors
     v = (first + tid) % vectors
     total = vec16d()
-    for m in range(number):
-        w = weights[b * number + m]
-        if w != 0.0:
-            total += wp.float64(w) * vec16d(images[m, v])
+    for begin in range(0, number, BLOCK):
+        part = vec16()
+        for m in range(begin, wp.min(begin + BLOCK, number)):
+            w = weights[b * number + m]
+            if w != 0.0:
+                part += w * images[m, v]
+        total += vec16d(part)
     blended[b, v] = vec16(total)
 
 

@@ -2,7 +2,7 @@
 
 `pack` lays the channels of each field out as planes padded to whole vectors; `distance_scan` walks
 them 16 points at a time, in float32 within a block and in float64 from block to block. Two queries
-share each load of the corpus.
+and two rows of the corpus share their loads.
 """
 
 import warp as wp
@@ -37,13 +37,24 @@ def pack(
             planes[target + p] = 0.0
 
 
+@wp.func
+def root(x: vec16):
+    """The square root of each."""
+    y = x
+    for lane in range(LANES):
+        y[lane] = wp.sqrt(x[lane])
+    return y
+
+
 @wp.kernel
 def distance_scan(
     queries: wp.array[vec16],  # (K, C, V)
-    planes: wp.array[vec16],  # (tile, C, V), row 0 is the first corpus row of this launch
+    planes: wp.array[vec16],  # (tile, C, V), row 0 is the corpus row `start`
     weights: wp.array[vec16],  # (V,)
     number: int,  # K
     corpus: int,  # N
+    start: int,
+    tile: int,  # corpus rows of this launch
     vectors: int,  # V
     channels: int,
     first: int,
@@ -56,33 +67,44 @@ def distance_scan(
         return
     pairs = (number + 1) / 2
     k0 = 2 * ((first + tid) % pairs)
-    k1 = wp.min(k0 + 1, number - 1)  # of an odd number the last query is done twice
-    n = (first + tid) / pairs
-    q0 = k0 * channels * vectors
-    q1 = k1 * channels * vectors
-    f = (n - first / pairs) * channels * vectors
-    total0 = wp.float64(0.0)
-    total1 = wp.float64(0.0)
-    for start in range(0, vectors, BLOCK):
-        part0 = vec16()
-        part1 = vec16()
-        for v in range(start, wp.min(start + BLOCK, vectors)):
-            norm0 = vec16()
-            norm1 = vec16()
-            for c in range(channels):
-                plane = planes[f + c * vectors + v]
-                r0 = queries[q0 + c * vectors + v] - plane
-                r1 = queries[q1 + c * vectors + v] - plane
-                norm0 += wp.cw_mul(r0, r0)
-                norm1 += wp.cw_mul(r1, r1)
-            for lane in range(LANES):
-                norm0[lane] = wp.sqrt(norm0[lane])
-            for lane in range(LANES):
-                norm1[lane] = wp.sqrt(norm1[lane])
-            part0 += wp.cw_mul(weights[v], norm0)
-            part1 += wp.cw_mul(weights[v], norm1)
+    k1 = wp.min(k0 + 1, number - 1)  # of an odd number the last is done twice
+    n0 = 2 * ((first + tid) / pairs)
+    n1 = wp.min(n0 + 1, tile - 1)
+    row = channels * vectors
+    total00 = wp.float64(0.0)
+    total01 = wp.float64(0.0)
+    total10 = wp.float64(0.0)
+    total11 = wp.float64(0.0)
+    for begin in range(0, vectors, BLOCK):
+        part00 = vec16()
+        part01 = vec16()
+        part10 = vec16()
+        part11 = vec16()
+        for v in range(begin, wp.min(begin + BLOCK, vectors)):
+            norm00 = vec16()
+            norm01 = vec16()
+            norm10 = vec16()
+            norm11 = vec16()
+            for i in range(v, row, vectors):
+                q0 = queries[k0 * row + i]
+                q1 = queries[k1 * row + i]
+                f0 = planes[n0 * row + i]
+                f1 = planes[n1 * row + i]
+                norm00 += wp.cw_mul(q0 - f0, q0 - f0)
+                norm01 += wp.cw_mul(q0 - f1, q0 - f1)
+                norm10 += wp.cw_mul(q1 - f0, q1 - f0)
+                norm11 += wp.cw_mul(q1 - f1, q1 - f1)
+            w = weights[v]
+            part00 += wp.cw_mul(w, root(norm00))
+            part01 += wp.cw_mul(w, root(norm01))
+            part10 += wp.cw_mul(w, root(norm10))
+            part11 += wp.cw_mul(w, root(norm11))
         for lane in range(LANES):
-            total0 += wp.float64(part0[lane])
-            total1 += wp.float64(part1[lane])
-    distance[k0 * corpus + n] = float(total0)
-    distance[k1 * corpus + n] = float(total1)
+            total00 += wp.float64(part00[lane])
+            total01 += wp.float64(part01[lane])
+            total10 += wp.float64(part10[lane])
+            total11 += wp.float64(part11[lane])
+    distance[k0 * corpus + start + n0] = float(total00)
+    distance[k0 * corpus + start + n1] = float(total01)
+    distance[k1 * corpus + start + n0] = float(total10)
+    distance[k1 * corpus + start + n1] = float(total11)

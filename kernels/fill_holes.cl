@@ -60,7 +60,7 @@ __kernel void pull(
     const int lower = (b * height + min(y + 1, height - 1)) * width;
     for (int column = 0; column < columns; ++column) {
         const int x = 2 * column;
-        const int right = min(x + 1, width - 1);
+        const int right = x + 1 < width ? x + 1 : x; /* min would be a call */
         float n00 = share(weight[upper + x], threshold, finest);
         float n01 = share(weight[upper + right], threshold, finest);
         float n10 = share(weight[lower + x], threshold, finest);

@@ -17,7 +17,7 @@ vec4d = wp.types.vector(length=GROUP, dtype=wp.float64)
 @wp.kernel
 def forward_warp(
     field: wp.array[float],  # (fields, H, W, C), fields is 1 or the batch
-    flow: wp.array[float],  # (flows, H, W, 2) [px], flows is 1 or the batch
+    flow: wp.array[wp.vec2],  # (flows, H, W) [px], flows is 1 or the batch
     fields: int,
     flows: int,
     batch: int,
@@ -42,33 +42,36 @@ def forward_warp(
     group = wp.min(channels - channel, GROUP)
     rows = (height + bands - 1) / bands
     base = worker * rows * width
+    for i in range(rows * width):
+        total[base + i] = vec4d()
+        mass[base + i] = wp.float64(0.0)
     for job in range(worker, batch * bands, workers):
         b = job / bands
         top = (job % bands) * rows
         bottom = wp.min(top + rows, height)
-        for i in range((bottom - top) * width):
-            total[base + i] = vec4d()
-            mass[base + i] = wp.float64(0.0)
         source = (b % fields) * height * width
         along = (b % flows) * height * width
         for sy in range(height):
             for sx in range(width):
                 s = sy * width + sx
-                qy = flow[2 * (along + s) + 1]
-                down = wp.floor(qy)
+                q = flow[along + s]
+                down = wp.floor(q[1])
                 y = sy + int(wp.clamp(down, -FAR, FAR))
                 if y >= top - 1 and y < bottom:
-                    qx = flow[2 * (along + s)]
-                    right = wp.floor(qx)
+                    right = wp.floor(q[0])
                     x = sx + int(wp.clamp(right, -FAR, FAR))
-                    fx = qx - right
-                    fy = qy - down
+                    fx = q[0] - right
+                    fy = q[1] - down
                     gx = 1.0 - fx
                     gy = 1.0 - fy
                     value = vec4d()
-                    for c in range(GROUP):
-                        if c < group:
-                            value[c] = wp.float64(field[(source + s) * channels + channel + c])
+                    pixel = (source + s) * channels + channel
+                    if group == GROUP:
+                        for c in range(GROUP):
+                            value[c] = wp.float64(field[pixel + c])
+                    else:
+                        for c in range(group):
+                            value[c] = wp.float64(field[pixel + c])
                     t = base + (y - top) * width + x
                     if x >= 0 and x + 1 < width and y >= top and y + 1 < bottom:
                         w00 = wp.float64(gx * gy)
@@ -98,6 +101,8 @@ def forward_warp(
             if w64 > wp.float64(0.0):
                 scale = wp.float64(1.0) / w64
             mean = total[base + i] * scale
+            total[base + i] = vec4d()  # for the next job
+            mass[base + i] = wp.float64(0.0)
             for c in range(GROUP):
                 if c < group:
                     warped[(start + i) * channels + channel + c] = float(mean[c])

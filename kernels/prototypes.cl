@@ -3,257 +3,254 @@
  * The flow that is missing to a prototype, carried to its pixels, is a fixed sparse mean of the
  * model's flow less a fixed flow (see mmmgpu/backends/orientation.py). Along it the pixels are
  * splatted into an accumulator that belongs to the worker alone. What received too little is filled
- * by pull-push, of which only the coarse levels and the pixels that are asked for are computed.
+ * by pull-push, where such a pixel is asked for.
+ *
+ * Everything is done for 16 neighbours of a row at a time: those of them that move by the same whole
+ * number of pixels are neighbours again where they arrive. So pictures are planes, one a channel,
+ * and their rows are padded to whole vectors; a padded row is a pitch.
  */
 
 #pragma OPENCL FP_CONTRACT OFF
 
-#define FAR 1.0e8f /* [px] beyond any picture, inside int */
-#define TAPS 6
+#include "lanes.cl"
+#include "pyramid.cl"
 
-/* Add pixel (sx, sy), carried along q, to the four pixels around where it arrives. */
-void splat(__global float4 *total, const int h, const int w, const int sy, const int sx,
-           const float2 q, const float4 value)
+#define NONE 2147483647 /* where a pixel that arrives nowhere goes */
+#define WHITE 65535.0f  /* the brightest value of a texture */
+
+/* Where the vector begins with which each pixel arrives at (x, y). */
+int16 starts_of(const int16 x, const int16 y, const int h, const int w, const int pitch)
 {
-    const float2 whole = floor(q);
-    const float2 f = q - whole;
-    const float2 g = 1.0f - f;
-    const int2 step = convert_int2(clamp(whole, -FAR, FAR));
-    const int x = sx + step.x;
-    const int y = sy + step.y;
-    const int t = y * w + x;
-    if (x >= 0 && x + 1 < w && y >= 0 && y + 1 < h) {
-        total[t] += g.x * g.y * value;
-        total[t + 1] += f.x * g.y * value;
-        total[t + w] += g.x * f.y * value;
-        total[t + w + 1] += f.x * f.y * value;
-    } else {
-        for (int tap = 0; tap < 4; ++tap) {
-            const int dx = tap % 2;
-            const int dy = tap / 2;
-            if (x + dx >= 0 && x + dx < w && y + dy >= 0 && y + dy < h)
-                total[t + dy * w + dx] += (dx ? f.x : g.x) * (dy ? f.y : g.y) * value;
-        }
-    }
+    const int16 reaches = x >= -1 & x < w & y >= -1 & y < h;
+    return reaches ? y * pitch + x - LANE : (int16)NONE;
 }
 
-/* Splat all pixels of prototype m; nothing is in the accumulator. */
-void move(const int m, __global const float4 *images, __global const float2 *fixed,
-          __global const int *taps, __global const float *shares, __global const int *rows,
-          __global const int *targets, __global const int *starts, __global const int *row_taps,
-          __global const float *row_shares, const int h, const int w, __global float2 *field,
-          __global float4 *total)
+/* Add one channel of a vector to the two rows on which it arrives. */
+void add_rows(__global float *t, const int pitch, const float16 upper_left,
+              const float16 upper_right, const float16 lower_left, const float16 lower_right)
 {
-    const int area = h * w;
-    for (int y = 0; y < h; ++y)
-        for (int x = 0; x < w; ++x) {
-            const int i = m * area + y * w + x;
-            if (taps[TAPS * i] < 0)
-                continue;
-            float2 near = -fixed[i];
-            for (int tap = 0; tap < TAPS; ++tap)
-                near += shares[TAPS * i + tap] * field[taps[TAPS * i + tap]];
-            splat(total, h, w, y, x, near, images[i]);
+    put(t, get(t) + (upper_left + one_later(upper_right)));
+    put(t + pitch, get(t + pitch) + (lower_left + one_later(lower_right)));
+}
+
+/* Add what the last pixel of a vector gives to the column right of it. */
+void add_last(__global float *t, const int pitch, const float upper, const float lower)
+{
+    t[0] += upper;
+    t[pitch] += lower;
+}
+
+/* The flow that is missing to prototype m, for each of its pixels. */
+void orient(const int m, __global const float *fixed, __global const int *firsts,
+            __global const int *deltas, __global const float *shares, __global const int *rows,
+            __global const int *targets, __global const int *starts, __global const int *row_taps,
+            __global const float *row_shares, const int area, const int nodes,
+            __global float *field, __global float *residual)
+{
+    const int vectors = area / LANES;
+    fixed += 2 * m * area;
+    for (int v = 0; v < vectors; ++v) {
+        const int i = LANES * v;
+        float16 x = -get(fixed + i);
+        float16 y = -get(fixed + area + i);
+        for (int k = firsts[m * vectors + v]; k < firsts[m * vectors + v + 1]; ++k) {
+            __global const float *at = field + i + deltas[k];
+            const float16 share = get(shares + LANES * k);
+            x += share * get(at);
+            y += share * get(at + nodes);
         }
+        put(residual + i, x);
+        put(residual + area + i, y);
+    }
     for (int row = rows[m]; row < rows[m + 1]; ++row) {
-        float2 far = (float2)(0.0f);
-        for (int j = starts[row]; j < starts[row + 1]; ++j)
-            far += row_shares[j] * field[row_taps[j]];
+        float right = 0.0f;
+        float down = 0.0f;
+        for (int j = starts[row]; j < starts[row + 1]; ++j) {
+            right += row_shares[j] * field[row_taps[j]];
+            down += row_shares[j] * field[row_taps[j] + nodes];
+        }
         const int s = targets[row];
-        const int i = m * area + s;
-        if (s < area)
-            splat(total, h, w, s / w, s % w, far - fixed[i], images[i]);
-        else
-            field[s] = far;
-    }
-}
-
-/* The mean and a weight of 1 where at least that weight arrived, else nothing. */
-float4 mean(const float4 sum, const float least)
-{
-    return sum.w >= least ? (float4)(1.0f / sum.w * sum.xyz, 1.0f) : (float4)(0.0f);
-}
-
-/* The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete. */
-float4 between(__global const float4 *coarse, const int h, const int w, const int y, const int x)
-{
-    const int columns = (w + 1) / 2;
-    const int x0 = x / 2;
-    const int x1 = clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1);
-    __global const float4 *y0 = coarse + y / 2 * columns;
-    __global const float4 *y1 = coarse + clamp(y / 2 + 2 * (y % 2) - 1, 0, (h - 1) / 2) * columns;
-    const float4 near = 0.75f * y0[x0] + 0.25f * y0[x1];
-    const float4 far = 0.75f * y1[x0] + 0.25f * y1[x1];
-    return 0.75f * near + 0.25f * far;
-}
-
-/* The level after this one of h x w: sums over blocks of 2 x 2. */
-void pull(__global float4 *fine, const int h, const int w)
-{
-    __global float4 *coarse = fine + h * w;
-    const int columns = (w + 1) / 2;
-    for (int y = 0; y < (h + 1) / 2; ++y) {
-        __global const float4 *upper = fine + 2 * y * w;
-        __global const float4 *lower = fine + min(2 * y + 1, h - 1) * w;
-        const float twice = 2 * y + 1 < h ? 1.0f : 0.5f;
-        for (int x = 0; x < columns; ++x) {
-            const int left = 2 * x;
-            const int right = min(left + 1, w - 1);
-            const float4 sum = upper[left] + upper[right] + (lower[left] + lower[right]);
-            const float share = left + 1 < w ? twice : 0.5f * twice;
-            coarse[y * columns + x] = share * sum;
+        if (s < area) {
+            residual[s] = right - fixed[s];
+            residual[area + s] = down - fixed[area + s];
+        } else {
+            field[s] = right;
+            field[nodes + s] = down;
         }
     }
 }
 
-/* Pull-push of a level of sums and all that follow. Returns the sum of all weights. */
-int fill(__global float4 *cells, const int height, const int width)
+/* Carry the pixels of prototype m, each to the four around where it arrives. */
+void splat(const int m, __global const ushort16 *textures, const int h, const int w,
+           const int pitch, __global const float *residual, __global float *total, const int step)
 {
-    int h = height;
-    int w = width;
-    __global float4 *at = cells;
-    int levels = 1;
-    while (h > 1 || w > 1) {
-        pull(at, h, w);
-        at += h * w;
-        h = (h + 1) / 2;
-        w = (w + 1) / 2;
-        ++levels;
-    }
-    const int number = (int)at[0].w;
-    for (int up = 0; up < levels; ++up) {
-        h = height;
-        w = width;
-        at = cells;
-        for (int level = 0; level < levels - 1 - up; ++level) {
-            at += h * w;
-            h = (h + 1) / 2;
-            w = (w + 1) / 2;
+    const int area = h * pitch;
+    const int vectors = area / LANES;
+    textures += 3 * m * vectors;
+    for (int v = 0; v < vectors; ++v) {
+        const int i = LANES * v;
+        const float16 qx = within_reach(get(residual + i));
+        const float16 qy = within_reach(get(residual + area + i));
+        const int16 right = whole(qx);
+        const int16 down = whole(qy);
+        const float16 fx = qx - convert_float16(right);
+        const float16 fy = qy - convert_float16(down);
+        const int16 x = right + LANE + i % pitch;
+        const int16 y = down + i / pitch;
+        const float16 left_share = inside(1.0f - fx, x, w);
+        const float16 right_share = inside(fx, x + 1, w);
+        const float16 upper_share = inside(1.0f - fy, y, h);
+        const float16 lower_share = inside(fy, y + 1, h);
+        const float16 upper_left = left_share * upper_share;
+        const float16 upper_right = right_share * upper_share;
+        const float16 lower_left = left_share * lower_share;
+        const float16 lower_right = right_share * lower_share;
+        const float16 red = convert_float16(textures[v]);
+        const float16 green = convert_float16(textures[v + vectors]);
+        const float16 blue = convert_float16(textures[v + 2 * vectors]);
+        int16 start = starts_of(x, y, h, w, pitch);
+        if (start.sf != NONE) {
+            __global float *t = total + start.sf + LANES;
+            const float a = upper_right.sf;
+            const float b = lower_right.sf;
+            add_last(t, pitch, a * red.sf, b * red.sf);
+            add_last(t + step, pitch, a * green.sf, b * green.sf);
+            add_last(t + 2 * step, pitch, a * blue.sf, b * blue.sf);
+            add_last(t + 3 * step, pitch, a, b);
         }
-        for (int y = 0; y < h; ++y)
-            for (int x = 0; x < w; ++x) {
-                const int i = y * w + x;
-                if (at[i].w > 0.0f)
-                    at[i] = mean(at[i], 1.0f);
-                else if (up > 0)
-                    at[i] = between(at + h * w, h, w, y, x);
-            }
+        int first = least(start);
+        while (first != NONE) {
+            const int16 same = start == first;
+            const float16 a00 = same ? upper_left : (float16)0.0f;
+            const float16 a10 = same ? upper_right : (float16)0.0f;
+            const float16 a01 = same ? lower_left : (float16)0.0f;
+            const float16 a11 = same ? lower_right : (float16)0.0f;
+            __global float *t = total + first;
+            add_rows(t, pitch, a00 * red, a10 * red, a01 * red, a11 * red);
+            add_rows(t + step, pitch, a00 * green, a10 * green, a01 * green, a11 * green);
+            add_rows(t + 2 * step, pitch, a00 * blue, a10 * blue, a01 * blue, a11 * blue);
+            add_rows(t + 3 * step, pitch, a00, a10, a01, a11);
+            start = same ? (int16)NONE : start;
+            first = least(start);
+        }
     }
-    return number;
 }
 
-/* Write a colour, or add it. */
-void show(__global float *out, const int i, const float4 colour, const int more)
+/* The least weight at a pixel that is asked for. */
+float least_asked(__global const float *weight, const int area, __global const float *scale)
 {
-    if (more)
-        vstore3(vload3(i, out) + colour.xyz, i, out);
-    else
-        vstore3(colour.xyz, i, out);
+    float16 low = (float16)HUGE;
+    for (int i = 0; i < area; i += LANES) {
+        const float16 n = get(weight + i);
+        low = (get(scale + i) > 0.0f & n < low) ? n : low;
+    }
+    return least_value(low);
 }
 
-/* Show what arrived, and what is filled, at pixels that have a place; empty the accumulator.
- *
- * Returns 0 where nothing arrived.
- */
-int settle(__global float4 *total, const int h, const int w, const float hole,
-           __global const int *places, __global const float *scale, const float weight,
-           const int more, __global float *out, __global float4 *cells, __global int *holes)
+/* From sums to means and a weight of 1, and nothing in holes. */
+void normalise(__global float *total, const int step, const int area, const float hole)
 {
-    const int columns = (w + 1) / 2;
-    int gaps = 0;
-    for (int y = 0; y < (h + 1) / 2; ++y)
-        for (int x = 0; x < columns; ++x) {
-            float4 block = (float4)(0.0f);
-            for (int tap = 0; tap < 4; ++tap) {
-                const int ty = 2 * y + tap / 2;
-                const int tx = 2 * x + tap % 2;
-                if (ty >= h || tx >= w)
-                    continue;
-                const int i = ty * w + tx;
-                const float4 colour = mean(total[i], hole);
-                total[i] = (float4)(0.0f);
-                block += colour;
-                if (places[i] < 0)
-                    continue;
-                if (colour.w > 0.0f)
-                    show(out, places[i], weight * scale[i] * colour, more);
-                else
-                    holes[gaps++] = i;
-            }
-            cells[y * columns + x] = block;
+    for (int i = 0; i < area; i += LANES) {
+        const float16 share = share_of(get(total + 3 * step + i), hole);
+        for (int c = 0; c < 4; ++c) {
+            __global float *at = total + c * step + i;
+            put(at, share * get(at));
         }
-    if (gaps == 0)
-        return 1;
-    const int number = fill(cells, (h + 1) / 2, columns);
-    for (int j = 0; j < gaps; ++j) {
-        const int i = holes[j];
-        const float4 colour = between(cells, h, w, i / w, i % w);
-        show(out, places[i], weight * scale[i] * colour, more);
     }
-    return number;
+}
+
+/* Write the means, or add them, and empty the accumulator. */
+void show(__global float *total, const int step, const int area, const float enough,
+          const float weight, __global const float *scale, const int more, __global float *out)
+{
+    for (int i = 0; i < area; i += LANES) {
+        const float16 share = weight * (get(scale + i) * share_of(get(total + 3 * step + i), enough));
+        for (int c = 0; c < 3; ++c) {
+            __global float *at = total + c * step + i;
+            float16 colour = share * get(at);
+            if (more)
+                colour += get(out + c * area + i);
+            put(out + c * area + i, colour);
+            put(at, (float16)0.0f);
+        }
+        put(total + 3 * step + i, (float16)0.0f);
+    }
 }
 
 __kernel void mix_prototypes(
-    __global const float2 *flows,  /* (frames, H * W) [px], frames is 1 or the mixtures */
-    __global const float4 *images, /* (M, H * W), weight 1 */
-    __global const float2 *fixed,  /* (M, H * W) [px] taken off the mean of a flow */
-    __global const int *taps,      /* (M, H * W, 6) pixels of the mean; first -1: own row */
-    __global const float *shares,  /* (M, H * W, 6) their shares */
-    __global const int *rows,      /* (M + 1) first row of each prototype */
-    __global const int *targets,   /* (rows) what a row is for: a pixel, or from H * W on a cell */
-    __global const int *starts,    /* (rows + 1) its first tap */
-    __global const int *row_taps,  /* pixels, or from H * W on cells of rows before */
+    __global const float *flows,       /* (frames, 2, H, pitch) [px]; frames: 1 or the mixtures */
+    __global const ushort16 *textures, /* (M, 3, H, pitch) of 65535 */
+    __global const float *fixed,       /* (M, 2, H, pitch) [px] taken off the mean of a flow */
+    __global const int *firsts,        /* (M * H * pitch / 16 + 1) first part of a vector's means */
+    __global const int *deltas,        /* (parts) how much further on in the flow a part lies */
+    __global const float *shares,      /* (parts, 16) the pixels' shares in it */
+    __global const int *rows,          /* (M + 1) first row of each prototype */
+    __global const int *targets,       /* (rows) a pixel, or from H * pitch + 16 on a cell */
+    __global const int *starts,        /* (rows + 1) its first tap */
+    __global const int *row_taps,      /* pixels or cells, of rows before */
     __global const float *row_shares,
-    __global const int *parts,     /* (mixtures + 1) first member of each mixture */
-    __global const int *members,   /* (parts[mixtures]) prototypes */
-    __global const float *weights, /* (parts[mixtures]) their weights */
-    __global const int *places,    /* (H * W) where a pixel is written, -1 for nowhere */
-    __global const float *scale,   /* (H * W) of what is written */
+    __global const int *parts,         /* (mixtures + 1) first member of each mixture */
+    __global const int *members,       /* (parts[mixtures]) prototypes */
+    __global const float *weights,     /* (parts[mixtures]) their weights */
+    __global const float *scale,       /* (H, pitch) of what is written; 0 where nothing is asked */
     const int frames,
     const int mixtures,
-    const int asked,               /* P places */
     const int height,
     const int width,
-    const int size,                /* of a pyramid without its finest level */
-    const int nodes,               /* H * W and cells of a prototype */
+    const int size,                    /* of a pyramid without its finest level */
+    const int nodes,                   /* 16, pixels, 16, and cells of a prototype */
     const float hole,
     const int workers,
     const int first,
     const int count,
     /* outputs */
-    __global float4 *total,        /* (workers, H * W) scratch */
-    __global float4 *cells,        /* (workers, size) scratch */
-    __global int *holes,           /* (workers, H * W) scratch */
-    __global float2 *field,        /* (workers, nodes) scratch */
-    __global float *mixed,         /* (mixtures, P, 3) */
-    __global int *arrived)         /* (mixtures,) 0 where a prototype has nothing but holes */
+    __global float *total,             /* (workers, 4, H * pitch + 2 (pitch + 32)) scratch: sums */
+    __global float *cells,             /* (workers, 4 size) scratch */
+    __global float *field,             /* (workers, 2, nodes) scratch */
+    __global float *residual,          /* (workers, 2, H, pitch) scratch */
+    __global float *mixed,             /* (mixtures, 3, H, pitch) */
+    __global int *arrived)             /* (mixtures,) 0 where a prototype has nothing but holes */
 {
     const int tid = get_global_id(0);
     if (tid >= count)
         return;
     const int worker = first + tid;
-    const int area = height * width;
-    total += worker * area;
-    cells += worker * size;
-    holes += worker * area;
-    field += worker * nodes;
-    for (int i = 0; i < area; ++i)
-        total[i] = (float4)(0.0f);
+    const int pitch = pitch_of(width);
+    const int area = height * pitch;
+    const int step = area + 2 * (pitch + 2 * LANES);
+    total += 4 * worker * step;
+    cells += 4 * worker * size;
+    field += 2 * worker * nodes;
+    residual += 2 * worker * area;
+    for (int i = 0; i < 4 * step; ++i)
+        total[i] = 0.0f;
+    for (int i = 0; i < 2 * nodes; ++i)
+        field[i] = 0.0f;
+    total += pitch + 2 * LANES;
+    field += LANES;
     for (int job = worker; job < mixtures; job += workers) {
-        __global float *out = mixed + 3 * job * asked;
+        __global float *out = mixed + 3 * job * area;
         if (frames > 1 || job == worker)
-            for (int i = 0; i < area; ++i)
-                field[i] = flows[job % frames * area + i];
+            for (int i = 0; i < area; ++i) {
+                field[i] = flows[2 * (job % frames) * area + i];
+                field[nodes + i] = flows[(2 * (job % frames) + 1) * area + i];
+            }
         arrived[job] = 1;
         if (parts[job] == parts[job + 1])
-            for (int i = 0; i < 3 * asked; ++i)
+            for (int i = 0; i < 3 * area; ++i)
                 out[i] = 0.0f;
         for (int part = parts[job]; part < parts[job + 1]; ++part) {
-            move(members[part], images, fixed, taps, shares, rows, targets, starts, row_taps,
-                 row_shares, height, width, field, total);
-            const int number = settle(total, height, width, hole, places, scale, weights[part],
-                                      part > parts[job], out, cells, holes);
-            arrived[job] = min(arrived[job], number);
+            orient(members[part], fixed, firsts, deltas, shares, rows, targets, starts, row_taps,
+                   row_shares, area, nodes, field, residual);
+            splat(members[part], textures, height, width, pitch, residual, total, step);
+            float enough = hole;
+            if (least_asked(total + 3 * step, area, scale) < hole) {
+                normalise(total, step, area, hole);
+                enough = 0.5f;
+                const int some = fill(total, step, height, width, scale, cells);
+                arrived[job] = some < arrived[job] ? some : arrived[job];
+            }
+            show(total, step, area, enough, weights[part] / WHITE, scale, part > parts[job], out);
         }
     }
 }

@@ -3,307 +3,370 @@
 The flow that is missing to a prototype, carried to its pixels, is a fixed sparse mean of the
 model's flow less a fixed flow (see mmmgpu/backends/orientation.py). Along it the pixels are
 splatted into an accumulator that belongs to the worker alone. What received too little is filled by
-pull-push, of which only the coarse levels and the pixels that are asked for are computed.
+pull-push, where such a pixel is asked for.
+
+Everything is done for 16 neighbours of a row at a time: those of them that move by the same whole
+number of pixels are neighbours again where they arrive. So pictures are planes, one a channel, and
+their rows are padded to whole vectors; a padded row is a pitch.
 """
 
 import warp as wp
 
+from mmmgpu.kernels.lanes import (
+    HUGE,
+    LANES,
+    LAST,
+    colours,
+    fraction,
+    get,
+    inside,
+    ivec16,
+    least,
+    one_later,
+    pitch_of,
+    put,
+    share_of,
+    uvec16,
+    vec16,
+    whole,
+)
+from mmmgpu.kernels.pyramid import fill
+
 wp.set_module_options({"enable_backward": False})
 
-FAR = wp.constant(1.0e8)  # [px] beyond any picture, inside int32
-vec2 = wp.types.vector(length=2, dtype=float)
-vec4 = wp.types.vector(length=4, dtype=float)  # red, green, blue and weight
-TAPS = 6
-shares_t = wp.types.vector(length=TAPS, dtype=float)
-taps_t = wp.types.vector(length=TAPS, dtype=int)
+NONE = wp.constant(2147483647)  # where a pixel that arrives nowhere goes
+WHITE = wp.constant(65535.0)  # the brightest value of a texture
 
 
 @wp.func
-def splat(total: wp.array[vec4], here: int, h: int, w: int, sy: int, sx: int, q: vec2, value: vec4):
-    """Add pixel (sx, sy), carried along `q`, to the four pixels around where it arrives."""
-    right = wp.floor(q[0])
-    down = wp.floor(q[1])
-    x = sx + int(wp.clamp(right, -FAR, FAR))
-    y = sy + int(wp.clamp(down, -FAR, FAR))
-    fx = q[0] - right
-    fy = q[1] - down
-    gx = 1.0 - fx
-    gy = 1.0 - fy
-    t = here + y * w + x
-    if x >= 0 and x + 1 < w and y >= 0 and y + 1 < h:
-        total[t] = total[t] + (gx * gy) * value
-        total[t + 1] = total[t + 1] + (fx * gy) * value
-        total[t + w] = total[t + w] + (gx * fy) * value
-        total[t + w + 1] = total[t + w + 1] + (fx * fy) * value
-    else:
-        for tap in range(4):
-            dx = tap % 2
-            dy = tap / 2
-            if x + dx >= 0 and x + dx < w and y + dy >= 0 and y + dy < h:
-                share = wp.where(dx == 1, fx, gx) * wp.where(dy == 1, fy, gy)
-                total[t + dy * w + dx] = total[t + dy * w + dx] + share * value
+def starts_of(x: ivec16, y: ivec16, h: int, w: int, pitch: int):
+    """Where the vector begins with which each pixel arrives at (x, y)."""
+    start = ivec16()
+    for j in range(LANES):
+        across = wp.uint32(x[j] + 1) <= wp.uint32(w)
+        down = wp.uint32(y[j] + 1) <= wp.uint32(h)
+        start[j] = wp.where(across and down, y[j] * pitch + x[j] - j, NONE)
+    return start
 
 
 @wp.func
-def move(
+def going_to(start: ivec16, here: int):
+    """1 for the pixels that go there, else 0."""
+    v = vec16()
+    for j in range(LANES):
+        v[j] = wp.where(start[j] == here, 1.0, 0.0)
+    return v
+
+
+@wp.func
+def others(start: ivec16, here: int):
+    left = ivec16()
+    for j in range(LANES):
+        left[j] = wp.where(start[j] == here, NONE, start[j])
+    return left
+
+
+@wp.func
+def add_rows(
+    total: wp.array[float],
+    t: int,
+    pitch: int,
+    upper_left: vec16,
+    upper_right: vec16,
+    lower_left: vec16,
+    lower_right: vec16,
+):
+    put(total, t, get(total, t) + (upper_left + one_later(upper_right)))
+    put(total, t + pitch, get(total, t + pitch) + (lower_left + one_later(lower_right)))
+
+
+@wp.func
+def add_plane(
+    total: wp.array[float],
+    t: int,
+    pitch: int,
+    value: vec16,
+    upper_left: vec16,
+    upper_right: vec16,
+    lower_left: vec16,
+    lower_right: vec16,
+):
+    """Add one channel of a vector to the two rows on which it arrives."""
+    add_rows(
+        total,
+        t,
+        pitch,
+        wp.cw_mul(upper_left, value),
+        wp.cw_mul(upper_right, value),
+        wp.cw_mul(lower_left, value),
+        wp.cw_mul(lower_right, value),
+    )
+
+
+@wp.func
+def add_last(total: wp.array[float], t: int, pitch: int, upper: float, lower: float):
+    """Add what the last pixel of a vector gives to the column right of it."""
+    total[t] = total[t] + upper
+    total[t + pitch] = total[t + pitch] + lower
+
+
+@wp.func
+def orient(
     m: int,
-    images: wp.array[vec4],
-    fixed: wp.array[vec2],
-    taps: wp.array[taps_t],
-    shares: wp.array[shares_t],
+    fixed: wp.array[float],
+    firsts: wp.array[int],
+    deltas: wp.array[int],
+    shares: wp.array[vec16],
     rows: wp.array[int],
     targets: wp.array[int],
     starts: wp.array[int],
     row_taps: wp.array[int],
     row_shares: wp.array[float],
-    h: int,
-    w: int,
-    field: wp.array[vec2],
+    area: int,
+    nodes: int,
+    field: wp.array[float],
     there: int,
-    total: wp.array[vec4],
+    residual: wp.array[float],
     here: int,
 ):
-    """Splat all pixels of prototype `m`; nothing is in the accumulator."""
-    area = h * w
-    for y in range(h):
-        for x in range(w):
-            i = m * area + y * w + x
-            k = taps[i]
-            if k[0] >= 0:
-                share = shares[i]
-                near = -fixed[i]
-                for tap in range(TAPS):
-                    near += share[tap] * field[there + k[tap]]
-                splat(total, here, h, w, y, x, near, images[i])
+    """The flow that is missing to prototype `m`, for each of its pixels."""
+    vectors = area / LANES
+    for v in range(vectors):
+        i = LANES * v
+        x = -get(fixed, 2 * m * area + i)
+        y = -get(fixed, (2 * m + 1) * area + i)
+        for k in range(firsts[m * vectors + v], firsts[m * vectors + v + 1]):
+            at = there + i + deltas[k]
+            x += wp.cw_mul(shares[k], get(field, at))
+            y += wp.cw_mul(shares[k], get(field, at + nodes))
+        put(residual, here + i, x)
+        put(residual, here + area + i, y)
     for row in range(rows[m], rows[m + 1]):
-        far = vec2()
+        right = float(0.0)
+        down = float(0.0)
         for j in range(starts[row], starts[row + 1]):
-            far += row_shares[j] * field[there + row_taps[j]]
+            at = there + row_taps[j]
+            right += row_shares[j] * field[at]
+            down += row_shares[j] * field[at + nodes]
         s = targets[row]
         if s < area:
-            i = m * area + s
-            splat(total, here, h, w, s / w, s % w, far - fixed[i], images[i])
+            residual[here + s] = right - fixed[2 * m * area + s]
+            residual[here + area + s] = down - fixed[(2 * m + 1) * area + s]
         else:
-            field[there + s] = far
+            field[there + s] = right
+            field[there + nodes + s] = down
 
 
 @wp.func
-def mean(sum: vec4, least: float):
-    """The mean and a weight of 1 where at least that weight arrived, else nothing."""
-    if sum[3] < least:
-        return vec4()
-    share = 1.0 / sum[3]
-    return vec4(share * sum[0], share * sum[1], share * sum[2], 1.0)
-
-
-@wp.func
-def between(cells: wp.array[vec4], coarse: int, h: int, w: int, y: int, x: int):
-    """The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete."""
-    columns = (w + 1) / 2
-    x0 = x / 2
-    x1 = wp.clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1)
-    y0 = coarse + y / 2 * columns
-    y1 = coarse + wp.clamp(y / 2 + 2 * (y % 2) - 1, 0, (h - 1) / 2) * columns
-    near = 0.75 * cells[y0 + x0] + 0.25 * cells[y0 + x1]
-    far = 0.75 * cells[y1 + x0] + 0.25 * cells[y1 + x1]
-    return 0.75 * near + 0.25 * far
-
-
-@wp.func
-def pull(cells: wp.array[vec4], fine: int, h: int, w: int):
-    """The level after the one of h x w at `fine`: sums over blocks of 2 x 2."""
-    coarse = fine + h * w
-    columns = (w + 1) / 2
-    for y in range((h + 1) / 2):
-        upper = fine + 2 * y * w
-        lower = fine + wp.min(2 * y + 1, h - 1) * w
-        double = wp.where(2 * y + 1 < h, 1.0, 0.5)
-        for x in range(columns):
-            left = 2 * x
-            right = wp.min(left + 1, w - 1)
-            sum = cells[upper + left] + cells[upper + right]
-            sum += cells[lower + left] + cells[lower + right]
-            share = wp.where(left + 1 < w, double, 0.5 * double)
-            cells[coarse + y * columns + x] = share * sum
-
-
-@wp.func
-def fill(cells: wp.array[vec4], first: int, height: int, width: int):
-    """Pull-push of a level of sums and all that follow. Returns the sum of all weights."""
-    h = int(height)
-    w = int(width)
-    at = int(first)
-    levels = int(1)
-    while h > 1 or w > 1:
-        pull(cells, at, h, w)
-        at += h * w
-        h = (h + 1) / 2
-        w = (w + 1) / 2
-        levels += 1
-    number = int(cells[at][3])
-    for up in range(levels):
-        h = int(height)
-        w = int(width)
-        at = int(first)
-        for _ in range(levels - 1 - up):
-            at += h * w
-            h = (h + 1) / 2
-            w = (w + 1) / 2
-        for y in range(h):
-            for x in range(w):
-                i = at + y * w + x
-                if cells[i][3] > 0.0:
-                    cells[i] = mean(cells[i], 1.0)
-                elif up > 0:
-                    cells[i] = between(cells, at + h * w, h, w, y, x)
-    return number
-
-
-@wp.func
-def show(out: wp.array[float], i: int, colour: vec4, more: int):
-    """Write a colour, or add it."""
-    for c in range(3):
-        if more == 1:
-            out[3 * i + c] = out[3 * i + c] + colour[c]
-        else:
-            out[3 * i + c] = colour[c]
-
-
-@wp.func
-def settle(
-    total: wp.array[vec4],
-    here: int,
+def splat(
+    m: int,
+    textures: wp.array[uvec16],
     h: int,
     w: int,
-    hole: float,
-    places: wp.array[int],
-    scale: wp.array[float],
+    pitch: int,
+    residual: wp.array[float],
+    there: int,
+    total: wp.array[float],
+    here: int,
+    step: int,
+):
+    """Carry the pixels of prototype `m`, each to the four around where it arrives."""
+    area = h * pitch
+    lane = ivec16()
+    for j in range(LANES):
+        lane[j] = j
+    one = vec16(1.0)
+    for v in range(area / LANES):
+        i = LANES * v
+        qx = get(residual, there + i)
+        qy = get(residual, there + area + i)
+        right = whole(qx)
+        down = whole(qy)
+        fx = fraction(qx, right)
+        fy = fraction(qy, down)
+        x = right + lane + ivec16(i % pitch)
+        y = down + ivec16(i / pitch)
+        gx = inside(one - fx, x, w)
+        fx = inside(fx, x + ivec16(1), w)
+        gy = inside(one - fy, y, h)
+        fy = inside(fy, y + ivec16(1), h)
+        upper_left = wp.cw_mul(gx, gy)
+        upper_right = wp.cw_mul(fx, gy)
+        lower_left = wp.cw_mul(gx, fy)
+        lower_right = wp.cw_mul(fx, fy)
+        red = colours(textures[(3 * m * area + i) / LANES])
+        green = colours(textures[((3 * m + 1) * area + i) / LANES])
+        blue = colours(textures[((3 * m + 2) * area + i) / LANES])
+        start = starts_of(x, y, h, w, pitch)
+        if start[LAST] != NONE:
+            t = here + start[LAST] + LANES
+            a = upper_right[LAST]
+            b = lower_right[LAST]
+            add_last(total, t, pitch, a * red[LAST], b * red[LAST])
+            add_last(total, t + step, pitch, a * green[LAST], b * green[LAST])
+            add_last(total, t + 2 * step, pitch, a * blue[LAST], b * blue[LAST])
+            add_last(total, t + 3 * step, pitch, a, b)
+        first = least(start)
+        while first != NONE:
+            same = going_to(start, first)
+            a00 = wp.cw_mul(same, upper_left)
+            a10 = wp.cw_mul(same, upper_right)
+            a01 = wp.cw_mul(same, lower_left)
+            a11 = wp.cw_mul(same, lower_right)
+            t = here + first
+            add_plane(total, t, pitch, red, a00, a10, a01, a11)
+            add_plane(total, t + step, pitch, green, a00, a10, a01, a11)
+            add_plane(total, t + 2 * step, pitch, blue, a00, a10, a01, a11)
+            add_rows(total, t + 3 * step, pitch, a00, a10, a01, a11)
+            start = others(start, first)
+            first = least(start)
+
+
+@wp.func
+def least_asked(total: wp.array[float], weight: int, area: int, scale: wp.array[float]):
+    """The least weight at a pixel that is asked for."""
+    low = vec16(HUGE)
+    for i in range(0, area, LANES):
+        s = get(scale, i)
+        n = get(total, weight + i)
+        for j in range(LANES):
+            low[j] = wp.where(s[j] > 0.0 and n[j] < low[j], n[j], low[j])
+    return wp.min(low)
+
+
+@wp.func
+def normalise(total: wp.array[float], here: int, step: int, area: int, hole: float):
+    """From sums to means and a weight of 1, and nothing in holes."""
+    for i in range(0, area, LANES):
+        n = get(total, here + 3 * step + i)
+        share = share_of(n, hole)
+        for c in range(4):
+            at = here + c * step + i
+            put(total, at, wp.cw_mul(share, get(total, at)))
+
+
+@wp.func
+def show(
+    total: wp.array[float],
+    here: int,
+    step: int,
+    area: int,
+    enough: float,
     weight: float,
+    scale: wp.array[float],
     more: int,
     out: wp.array[float],
     start: int,
-    cells: wp.array[vec4],
-    first: int,
-    holes: wp.array[int],
 ):
-    """Show what arrived, and what is filled, at pixels that have a place; empty the accumulator.
-
-    Returns 0 where nothing arrived.
-    """
-    columns = (w + 1) / 2
-    gaps = int(0)
-    for y in range((h + 1) / 2):
-        for x in range(columns):
-            block = vec4()
-            for tap in range(4):
-                ty = 2 * y + tap / 2
-                tx = 2 * x + tap % 2
-                if ty < h and tx < w:
-                    i = ty * w + tx
-                    colour = mean(total[here + i], hole)
-                    total[here + i] = vec4()
-                    block += colour
-                    if places[i] >= 0:
-                        if colour[3] > 0.0:
-                            show(out, start + places[i], weight * scale[i] * colour, more)
-                        else:
-                            holes[here + gaps] = i
-                            gaps += 1
-            cells[first + y * columns + x] = block
-    if gaps == 0:
-        return 1
-    number = fill(cells, first, (h + 1) / 2, columns)
-    for j in range(gaps):
-        i = holes[here + j]
-        colour = between(cells, first, h, w, i / w, i % w)
-        show(out, start + places[i], weight * scale[i] * colour, more)
-    return number
+    """Write the means, or add them, and empty the accumulator."""
+    for i in range(0, area, LANES):
+        n = get(total, here + 3 * step + i)
+        share = weight * wp.cw_mul(get(scale, i), share_of(n, enough))
+        for c in range(3):
+            at = here + c * step + i
+            colour = wp.cw_mul(share, get(total, at))
+            if more == 1:
+                colour += get(out, start + c * area + i)
+            put(out, start + c * area + i, colour)
+            put(total, at, vec16())
+        put(total, here + 3 * step + i, vec16())
 
 
 @wp.kernel
 def mix_prototypes(
-    flows: wp.array[vec2],  # (frames, H * W) [px] of the model, frames is 1 or the mixtures
-    images: wp.array[vec4],  # (M, H * W), weight 1
-    fixed: wp.array[vec2],  # (M, H * W) [px] taken off the mean of a flow
-    taps: wp.array[taps_t],  # (M, H * W, 6) pixels of the mean; first -1: there is a row for it
-    shares: wp.array[shares_t],  # (M, H * W, 6) their shares
+    flows: wp.array[float],  # (frames, 2, H, pitch) [px] of the model; frames: 1 or the mixtures
+    textures: wp.array[uvec16],  # (M, 3, H, pitch) of 65535
+    fixed: wp.array[float],  # (M, 2, H, pitch) [px] taken off the mean of a flow
+    firsts: wp.array[int],  # (M * H * pitch / 16 + 1) first part of each vector's means
+    deltas: wp.array[int],  # (parts) how much further on in the flow a part lies
+    shares: wp.array[vec16],  # (parts) the pixels' shares in it
     rows: wp.array[int],  # (M + 1) first row of each prototype
-    targets: wp.array[int],  # (rows) what a row is for: a pixel, or from H * W on a cell
+    targets: wp.array[int],  # (rows) what a row is for: a pixel, or from H * pitch + 16 on a cell
     starts: wp.array[int],  # (rows + 1) its first tap
-    row_taps: wp.array[int],  # pixels, or from H * W on cells of rows before
+    row_taps: wp.array[int],  # pixels or cells, of rows before
     row_shares: wp.array[float],
     parts: wp.array[int],  # (mixtures + 1) first member of each mixture
     members: wp.array[int],  # (parts[mixtures]) prototypes
     weights: wp.array[float],  # (parts[mixtures]) their weights
-    places: wp.array[int],  # (H * W) where a pixel is written, -1 for nowhere
-    scale: wp.array[float],  # (H * W) of what is written
+    scale: wp.array[float],  # (H, pitch) of what is written; 0 where nothing is asked for
     frames: int,
     mixtures: int,
-    asked: int,  # P places
     height: int,
     width: int,
     size: int,  # of a pyramid without its finest level
-    nodes: int,  # H * W and cells of a prototype
+    nodes: int,  # 16, pixels, 16, and cells of a prototype
     hole: float,
     workers: int,
     first: int,
     count: int,
     # outputs
-    total: wp.array[vec4],  # (workers, H * W) scratch
-    cells: wp.array[vec4],  # (workers, size) scratch
-    holes: wp.array[int],  # (workers, H * W) scratch
-    field: wp.array[vec2],  # (workers, nodes) scratch
-    mixed: wp.array[float],  # (mixtures, P, 3)
+    total: wp.array[float],  # (workers, 4, H * pitch + 2 (pitch + 32)) scratch: sums
+    cells: wp.array[float],  # (workers, 4 size) scratch
+    field: wp.array[float],  # (workers, 2, nodes) scratch
+    residual: wp.array[float],  # (workers, 2, H, pitch) scratch
+    mixed: wp.array[float],  # (mixtures, 3, H, pitch)
     arrived: wp.array[int],  # (mixtures,) 0 where a prototype has nothing but holes
 ):
     tid = wp.tid()
     if tid >= count:
         return
     worker = first + tid
-    area = height * width
-    for i in range(area):
-        total[worker * area + i] = vec4()
+    pitch = pitch_of(width)
+    area = height * pitch
+    step = area + 2 * (pitch + 2 * LANES)
+    for i in range(0, 4 * step, LANES):
+        put(total, 4 * worker * step + i, vec16())
+    for i in range(2 * nodes):
+        field[2 * worker * nodes + i] = 0.0
+    here = 4 * worker * step + pitch + 2 * LANES
+    there = 2 * worker * nodes + LANES
     for job in range(worker, mixtures, workers):
         if frames > 1 or job == worker:
-            for i in range(area):
-                field[worker * nodes + i] = flows[job % frames * area + i]
+            for i in range(0, area, LANES):
+                x = 2 * (job % frames) * area + i
+                put(field, there + i, get(flows, x))
+                put(field, there + nodes + i, get(flows, x + area))
         arrived[job] = 1
         if parts[job] == parts[job + 1]:
-            for i in range(3 * asked):
-                mixed[3 * job * asked + i] = 0.0
+            for i in range(0, 3 * area, LANES):
+                put(mixed, 3 * job * area + i, vec16())
         for part in range(parts[job], parts[job + 1]):
-            move(
+            orient(
                 members[part],
-                images,
                 fixed,
-                taps,
+                firsts,
+                deltas,
                 shares,
                 rows,
                 targets,
                 starts,
                 row_taps,
                 row_shares,
-                height,
-                width,
+                area,
+                nodes,
                 field,
-                worker * nodes,
-                total,
-                worker * area,
+                there,
+                residual,
+                2 * worker * area,
             )
-            number = settle(
-                total,
-                worker * area,
+            splat(
+                members[part],
+                textures,
                 height,
                 width,
-                hole,
-                places,
-                scale,
-                weights[part],
-                wp.where(part > parts[job], 1, 0),
-                mixed,
-                job * asked,
-                cells,
-                worker * size,
-                holes,
+                pitch,
+                residual,
+                2 * worker * area,
+                total,
+                here,
+                step,
             )
-            arrived[job] = wp.min(arrived[job], number)
+            enough = float(hole)
+            if least_asked(total, here + 3 * step, area, scale) < hole:
+                normalise(total, here, step, area, hole)
+                enough = 0.5
+                some = fill(total, here, step, height, width, scale, cells, 4 * worker * size)
+                arrived[job] = wp.min(arrived[job], some)
+            more = wp.where(part > parts[job], 1, 0)
+            out = 3 * job * area
+            show(total, here, step, area, enough, weights[part] / WHITE, scale, more, mixed, out)

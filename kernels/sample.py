@@ -1,14 +1,26 @@
-"""Bilinear gather with the border clamped."""
+"""Bilinear gather with the border clamped: a run of points a thread.
+
+Pictures have a kernel of their own: Warp finds the address of every element it reads anew, and a
+colour is one element.
+"""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+RUN = 16
+
+
+@wp.func
+def within(x: float, most: float):
+    """0 ... most; wp.clamp minds NaN."""
+    return wp.where(x < 0.0, 0.0, wp.where(x > most, most, x))
+
 
 @wp.kernel
 def sample(
     field: wp.array[float],  # (fields, H, W, C), fields is 1 or the batch
-    points: wp.array[float],  # (sets, N, 2) = (x, y) [px], sets is 1 or the batch
+    points: wp.array[wp.vec2],  # (sets, N) = (x, y) [px], sets is 1 or the batch
     fields: int,
     sets: int,
     number: int,  # N
@@ -23,22 +35,63 @@ def sample(
     tid = wp.tid()
     if tid >= count:
         return
-    i = first + tid
-    b = i / number
-    p = (b % sets) * number + i % number
-    x = wp.clamp(points[2 * p], 0.0, float(width - 1))
-    y = wp.clamp(points[2 * p + 1], 0.0, float(height - 1))
-    x0 = int(x)
-    y0 = int(y)
-    fx = x - float(x0)
-    fy = y - float(y0)
-    x1 = wp.min(x0 + 1, width - 1)
-    y1 = wp.min(y0 + 1, height - 1)
-    near = ((b % fields) * height + y0) * width
-    far = ((b % fields) * height + y1) * width
-    for c in range(channels):
-        a0 = (1.0 - fx) * field[(near + x0) * channels + c]
-        a0 += fx * field[(near + x1) * channels + c]
-        a1 = (1.0 - fx) * field[(far + x0) * channels + c]
-        a1 += fx * field[(far + x1) * channels + c]
-        sampled[i * channels + c] = (1.0 - fy) * a0 + fy * a1
+    runs = (number + RUN - 1) / RUN
+    b = (first + tid) / runs
+    start = (first + tid) % runs * RUN
+    origin = (b % fields) * height * width
+    right = float(width - 1)
+    bottom = float(height - 1)
+    for p in range(start, wp.min(start + RUN, number)):
+        point = points[(b % sets) * number + p]
+        x = within(point[0], right)
+        y = within(point[1], bottom)
+        x0 = int(x)
+        y0 = int(y)
+        fx = x - float(x0)
+        fy = y - float(y0)
+        step = wp.where(x0 + 1 < width, channels, 0)
+        near = (origin + y0 * width + x0) * channels
+        far = wp.where(y0 + 1 < height, near + width * channels, near)
+        for c in range(channels):
+            a0 = (1.0 - fx) * field[near + c] + fx * field[near + step + c]
+            a1 = (1.0 - fx) * field[far + c] + fx * field[far + step + c]
+            sampled[(b * number + p) * channels + c] = (1.0 - fy) * a0 + fy * a1
+
+
+@wp.kernel
+def sample_pictures(
+    pictures: wp.array[wp.vec3],  # (fields, H, W), fields is 1 or the batch
+    points: wp.array[wp.vec2],  # (sets, N) = (x, y) [px], sets is 1 or the batch
+    fields: int,
+    sets: int,
+    number: int,  # N
+    height: int,
+    width: int,
+    first: int,
+    count: int,
+    # outputs
+    sampled: wp.array[wp.vec3],  # (batch, N)
+):
+    tid = wp.tid()
+    if tid >= count:
+        return
+    runs = (number + RUN - 1) / RUN
+    b = (first + tid) / runs
+    start = (first + tid) % runs * RUN
+    origin = (b % fields) * height * width
+    right = float(width - 1)
+    bottom = float(height - 1)
+    for p in range(start, wp.min(start + RUN, number)):
+        point = points[(b % sets) * number + p]
+        x = within(point[0], right)
+        y = within(point[1], bottom)
+        x0 = int(x)
+        y0 = int(y)
+        fx = x - float(x0)
+        fy = y - float(y0)
+        step = wp.where(x0 + 1 < width, 1, 0)
+        near = origin + y0 * width + x0
+        far = wp.where(y0 + 1 < height, near + width, near)
+        a0 = (1.0 - fx) * pictures[near] + fx * pictures[near + step]
+        a1 = (1.0 - fx) * pictures[far] + fx * pictures[far + step]
+        sampled[b * number + p] = (1.0 - fy) * a0 + fy * a1

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from mmmgpu.backends import Backend
+from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import LIP, MOUTH, Basis, around, cut
 from mmmgpu.errors import InputError
 from mmmgpu.flows import Matcher, concatenate, matcher, pull
@@ -41,6 +42,7 @@ LEAST = 16  # [px] width and height of a picture that flow is looked for in
 TINY = 1e-12  # least weight of a product of slopes
 NEAREST = 16  # prototypes that the first estimate of beta is made of
 STILL = 1e-6  # [px^2] mean square of a flow that is none
+UNSEEN = 0.01  # sqrt(w_t) of a pixel outside the mask, so that a step sees it too
 THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are looked for
 
 
@@ -50,12 +52,12 @@ class Analyzer:
 
     basis: cut to the rectangle `inside` in which the masks are not zero.
     kernels, held: the backend, and the prototypes on it.
-    pixels: indices of the n reference pixels with w_f above 0.02; weight (n,): w_f there.
+    pixels: indices of n reference pixels, every second of those with w_f above 0.02; weight (n,):
+        w_f there.
     along: the prototype flows there, x above y, (2 n, M - 1).
     gram: Cholesky factor of the regularised Gram matrix of the flows.
-    order: indices of all pixels, those with w_t above 0.01 first; textured: how many these are.
-    scale: sqrt(w_t) of these, 1 of the others, (h, w).
-    places, masked: each pixel's place in that order, (h, w), and the same with -1 for the others.
+    everywhere: sqrt(w_t), but not below 0.01: what a step needs to see, (h, pitch).
+    masked: sqrt(w_t) where that is above 0.1, else 0, (h, pitch).
     thumbnails: small masked prototypes, (M, k).
     """
 
@@ -68,11 +70,8 @@ class Analyzer:
     weight: F32
     along: F32
     gram: tuple[Floats, bool]
-    order: NDArray[np.int64]
-    textured: int
-    scale: F32
-    places: NDArray[np.int32]
-    masked: NDArray[np.int32]
+    everywhere: F32
+    masked: F32
     thumbnails: F32
 
 
@@ -84,7 +83,7 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
     """
     inside = around((basis.w_t > MOUTH) | (basis.w_f > LIP))
     basis = cut(basis, inside)
-    pixels = np.flatnonzero(basis.w_f > LIP)
+    pixels = np.flatnonzero((basis.w_f > LIP) & chessboard(basis.w_f.shape))
     weight = basis.w_f.ravel()[pixels]
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
     along = np.ascontiguousarray(moving.transpose(2, 1, 0).reshape(2 * len(pixels), -1))
@@ -96,9 +95,7 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
             "the mouth never moves in the prototypes; give clips of speech, or --region X,Y,W,H"
         )
     regular = gram.astype(np.float64) + FLOW_RIDGE * energy * np.eye(len(gram))
-    textured = basis.w_t > MOUTH
-    order = np.argsort(~textured.ravel(), kind="stable")
-    places = np.argsort(order).astype(np.int32).reshape(basis.w_t.shape)
+    root = np.sqrt(basis.w_t)
     return Analyzer(
         basis=basis,
         inside=inside,
@@ -109,13 +106,16 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
         weight=weight,
         along=along,
         gram=cho_factor(regular),
-        order=order,
-        textured=int(textured.sum()),
-        scale=np.where(textured, np.sqrt(basis.w_t), np.float32(1)),
-        places=places,
-        masked=np.where(textured, places, np.int32(-1)),
+        everywhere=planes(np.maximum(root, UNSEEN)[..., None])[0],
+        masked=planes(np.where(basis.w_t > MOUTH, root, 0)[..., None])[0],
         thumbnails=np.stack([thumbnail(image, basis.w_t) for image in basis.images]),
     )
+
+
+def chessboard(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Every second pixel of a picture (h, w): neighbours say nearly the same of a flow."""
+    y, x = np.indices(shape)
+    return np.asarray((x + y) % 2 == 0)
 
 
 def byte_thumbnail(image: F32, mask: F32) -> NDArray[np.uint8]:
@@ -134,19 +134,20 @@ def thumbnail(image: F32, mask: F32) -> F32:
 def analyze(analyzer: Analyzer, image: F32) -> tuple[Floats, Floats]:
     """(alpha (M - 1,), beta (M,)) of a region `image`, (h, w, 3) in [0, 1]."""
     image = np.ascontiguousarray(image[analyzer.inside])
+    wanted = planes(image)
     small = thumbnail(image, analyzer.basis.w_t)
     order = np.argsort(((analyzer.thumbnails - small) ** 2).sum(axis=1))
     alpha = fit_flow(analyzer, _flow_to(analyzer, image, int(order[0])))
     used = np.sort(order[:NEAREST])
     for _ in range(STEPS):
         flow = analyzer.basis.flow(alpha)
-        beta, made = _fit_texture(analyzer, image, flow, used)
+        beta, made = _fit_texture(analyzer, wanted, flow, used)
         alpha = _refine(analyzer, image, alpha, flow, made)
         used = np.flatnonzero(beta > NO_TEXTURE)
     every = np.arange(len(analyzer.thumbnails))
     flow = analyzer.basis.flow(alpha)
-    warped = _warped(analyzer, flow, every, analyzer.masked, analyzer.textured)
-    return alpha, _fit_beta(analyzer, image, warped, every)
+    warped = _warped(analyzer, flow, every, analyzer.masked)
+    return alpha, _fit_beta(analyzer, wanted, warped, every, analyzer.masked)
 
 
 def _flow_to(analyzer: Analyzer, image: F32, nearest: int) -> F32:
@@ -219,38 +220,32 @@ def _pulled(analyzer: Analyzer, field: F32, flow: F32) -> F32:
 
 
 def _fit_texture(
-    analyzer: Analyzer, image: F32, flow: F32, used: NDArray[np.int64]
+    analyzer: Analyzer, wanted: F32, flow: F32, used: NDArray[np.int64]
 ) -> tuple[Floats, F32]:
-    """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3)."""
-    warped = _warped(analyzer, flow, used, analyzer.places, len(analyzer.order))
-    beta = _fit_beta(analyzer, image, warped, used)
-    mixed = (beta[used].astype(np.float32) @ warped).reshape(-1, 3)
-    made = mixed[analyzer.places] / analyzer.scale[..., None]
-    return beta, made
+    """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3); `wanted` as planes."""
+    scale = analyzer.everywhere
+    warped = _warped(analyzer, flow, used, scale)
+    beta = _fit_beta(analyzer, wanted, warped, used, scale)
+    mixed = (beta[used].astype(np.float32) @ warped).reshape(wanted.shape)
+    width = flow.shape[1]
+    return beta, picture(mixed[..., :width] / scale[:, :width], width)
 
 
-def _warped(
-    analyzer: Analyzer,
-    flow: F32,
-    used: NDArray[np.int64],
-    places: NDArray[np.int32],
-    count: int,
-) -> F32:
-    """The prototypes `used` (n,) along `flow`, scaled, at `count` places: (n, 3 count)."""
+def _warped(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: F32) -> F32:
+    """The prototypes `used` (n,) along `flow`, scaled, as planes: (n, 3 h pitch)."""
     k = analyzer.kernels
-    given = (flow, used.astype(np.int32), places, analyzer.scale)
-    to, which, where, scale = map(k.to_device, given)
-    moved = k.move_prototypes(analyzer.held, to, which, where, scale, count)
-    return k.to_host(moved).reshape(len(used), 3 * count)
+    to, which, how = map(k.to_device, (planes(flow[None]), used.astype(np.int32), scale))
+    moved = k.move_prototypes(analyzer.held, to, which, how)
+    return k.to_host(moved).reshape(len(used), -1)
 
 
-def _fit_beta(analyzer: Analyzer, image: F32, warped: F32, used: NDArray[np.int64]) -> Floats:
-    """beta (M,), zero outside `used`; warped: what `_warped` gives."""
-    scaled = (image * analyzer.scale[..., None]).reshape(-1, 3)
-    wanted = scaled[analyzer.order[: analyzer.textured]].ravel()
-    a = warped[:, : len(wanted)]
+def _fit_beta(
+    analyzer: Analyzer, wanted: F32, warped: F32, used: NDArray[np.int64], scale: F32
+) -> Floats:
+    """beta (M,), zero outside `used`; warped: what `_warped` gives for `scale`."""
+    scaled = (wanted * scale).ravel()
     beta = np.zeros(len(analyzer.thumbnails))
-    beta[used] = solve_simplex(a @ a.T, a @ wanted)
+    beta[used] = solve_simplex(warped @ warped.T, warped @ scaled)
     return beta
 
 

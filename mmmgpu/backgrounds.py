@@ -44,8 +44,10 @@ def open_background(model: Model, path: Path | None) -> Iterator[Background]:
         yield Background(own, probe(own).fps, model.calm.track)
 
 
-def extended(background: Background, length: int) -> Iterator[tuple[NDArray[np.uint8], int]]:
+def extended(background: Background, length: float) -> Iterator[tuple[NDArray[np.uint8], int]]:
     """Yield `length` frames with their numbers: forth, then back and forth over the last ones.
+
+    `length` may be infinite.
 
     Going back over the frames just seen has no jump. As many are kept as `BYTES_KEPT` holds.
     """

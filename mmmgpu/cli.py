@@ -12,10 +12,12 @@ from mmmgpu.commands import (
     aam,
     adapt,
     align,
+    bench,
     compare,
     demo,
     evaluate,
     info,
+    live,
     mark,
     reconstruct,
     speak,
@@ -67,6 +69,7 @@ for _command, _example in (
     (train.train, train.EXAMPLE),
     (reconstruct.reconstruct, reconstruct.EXAMPLE),
     (speak.speak, speak.EXAMPLE),
+    (live.live, live.EXAMPLE),
     (evaluate.evaluate, evaluate.EXAMPLE),
     (compare.compare, compare.EXAMPLE),
     (mark.mark, mark.EXAMPLE),
@@ -75,6 +78,7 @@ for _command, _example in (
     (info.info, info.EXAMPLE),
 ):
     app.command(epilog=_example)(guarded(_command))
+app.add_typer(bench.app, name="bench")
 app.add_typer(study.app, name="study")
 
 

@@ -14,6 +14,13 @@ Picture = NDArray[np.uint8]
 
 MOST_GRAIN = 2.5 / 255  # standard deviation of added grain, at most
 RING = (0.02, 0.6)  # cover in which model and background are compared
+REACH = 3  # [px] beyond the cover, from which cubic interpolation still takes colours
+
+
+def looked_at(cover: F32) -> NDArray[np.bool_]:
+    """The pixels of a region image that a composite with `cover` (h, w) depends on, (h, w)."""
+    around = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    return cv2.dilate((cover > 0).astype(np.uint8), around).astype(bool)
 
 
 def composite(
@@ -24,7 +31,7 @@ def composite(
     The image is in the colours of the reference and is returned to those of the clip. Pixels that
     the cover does not reach keep their bits.
     """
-    own = np.asarray((image - track.offset) / track.gain, np.float32)
+    own = _as_filmed(image, track)
     box, placed, opacity = _place(own, cover, pose, region, frame.shape)
     return _over(frame, box, placed, opacity)
 
@@ -42,7 +49,7 @@ def composite_matched(
 
     What differs at the rim is fitted by a plane a + b x + c y per channel and added everywhere.
     """
-    own = np.asarray((image - track.offset) / track.gain, np.float32)
+    own = _as_filmed(image, track)
     box, placed, opacity = _place(own, cover, pose, region, frame.shape)
     under = np.asarray(frame[box] / np.float32(255), np.float32)
     rim = (opacity > RING[0]) & (opacity < RING[1])
@@ -50,6 +57,12 @@ def composite_matched(
         placed += _plane(under - placed, rim)
         placed += _grain(under, placed, rim, rng)
     return _over(frame, box, placed, opacity)
+
+
+def _as_filmed(image: F32, track: Track) -> F32:
+    """`image` (h, w, 3) in the colours of the reference, in those of the clip."""
+    gain = (1 / track.gain).astype(np.float32)
+    return np.asarray(image * gain - (track.offset / track.gain).astype(np.float32))
 
 
 def _place(
@@ -75,9 +88,9 @@ def _place(
 def _over(frame: Picture, box: tuple[slice, slice], placed: F32, opacity: F32) -> Picture:
     result = frame.copy()
     share = opacity[..., None]
-    mixed = share * placed * 255 + (1 - share) * frame[box]
-    touched = opacity > 0
-    result[box][touched] = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)[touched]
+    mixed = share * (placed * 255 - frame[box]) + frame[box]
+    seen = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
+    np.copyto(result[box], seen, where=share > 0)
     return result
 
 
@@ -100,7 +113,8 @@ def _plane(difference: F32, rim: NDArray[np.bool_]) -> F32:
 
 def _grain(under: F32, placed: F32, rim: NDArray[np.bool_], rng: np.random.Generator) -> F32:
     """Noise (h, w, 1) that gives `placed` the fine texture that the frame has at the rim."""
-    fine = [g - cv2.GaussianBlur(g, (0, 0), 1.0) for g in (under.mean(-1), placed.mean(-1))]
+    grey = [cv2.transform(image, np.full((1, 3), 1 / 3)) for image in (under, placed)]
+    fine = [g - cv2.GaussianBlur(g, (0, 0), 1.0) for g in grey]
     deviation = [1.4826 * float(np.median(np.abs(f[rim]))) for f in fine]  # edges do not count
     strength = min(np.sqrt(max(deviation[0] ** 2 - deviation[1] ** 2, 0.0)), MOST_GRAIN)
     noise = cv2.GaussianBlur(rng.standard_normal(rim.shape).astype(np.float32), (0, 0), 0.5)

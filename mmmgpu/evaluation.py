@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.errors import InputError
 from mmmgpu.landmarks import (
@@ -25,7 +24,7 @@ from mmmgpu.landmarks import (
     read_landmarks,
 )
 from mmmgpu.models import Model, project_on_simplex, trajectories
-from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
+from mmmgpu.parallel import one_thread_each
 from mmmgpu.pictures import psnr, ssim
 from mmmgpu.progress import progress
 from mmmgpu.reconstruction import Analysed, analyse_clip
@@ -39,7 +38,7 @@ from mmmgpu.statistics import (
     speech_frames,
     variance_ratio,
 )
-from mmmgpu.synthesis import synthesize_one
+from mmmgpu.synthesis import Synthesizer, prepare_synthesis, synthesize_batch
 from mmmgpu.tracks import crops
 from mmmgpu.videos import read_frames
 
@@ -251,10 +250,11 @@ def _lips(
 def _pictures(model: Model, spoken: Sequence[_Spoken], backend: str) -> dict[str, Any]:
     """PSNR [dB] of rendered speech frames under w_t, from the mean squared error of each clip."""
     found: dict[str, list[float]] = {kind: [] for kind in kinds_of(model)}
+    synthesizer = prepare_synthesis(model.basis, shown=model.basis.w_t > 0, backend=backend)
     for s in spoken:
         if not s.speech.any():
             continue
-        for kind, error in _picture_errors(model, s, backend).items():
+        for kind, error in _picture_errors(model, s, synthesizer).items():
             found[kind].append(float(-10 * np.log10(max(error, 1e-10))))
     gain = paired_interval(found["trained"], found["pooled"])
     return {
@@ -267,27 +267,21 @@ def _pictures(model: Model, spoken: Sequence[_Spoken], backend: str) -> dict[str
     }
 
 
-def _picture_errors(model: Model, s: _Spoken, backend: str) -> dict[str, float]:
+def _picture_errors(model: Model, s: _Spoken, synthesizer: Synthesizer) -> dict[str, float]:
     """Mean squared error under w_t of the speech frames of one clip, for each kind."""
-    kernels, basis, track = get_backend(backend, 1), model.basis, s.analysed.track
+    basis, track = model.basis, s.analysed.track
     weight = basis.w_t[..., None] / (3 * basis.w_t.sum())
     kinds = kinds_of(model)
-    betas = {kind: focused(project_on_simplex(s.made[kind, "beta"])) for kind in kinds}
-
-    def one(item: tuple[int, F32], _: Cancelled) -> list[float]:
-        t, real = item
-        made = (
-            synthesize_one(basis, s.made[kind, "alpha"][t], betas[kind][t], kernels)
-            for kind in kinds
-        )
-        return [float((weight * (image - real) ** 2).sum()) for image in made]
-
-    seen = enumerate(crops(s.clip.path, track, basis.region))
-    frames = ((t, image) for t, image in seen if s.speech[t])
-    rendered = map_ordered(one, frames, threads=default_threads())
+    alpha = np.stack([s.made[kind, "alpha"] for kind in kinds], axis=1)
+    beta = np.stack([focused(project_on_simplex(s.made[kind, "beta"])) for kind in kinds], axis=1)
+    errors = []
     label, total = f"render {s.clip.path.name}", int(s.speech.sum())
-    errors = np.array(list(progress(rendered, label, total=total)))
-    return dict(zip(kinds, errors.mean(axis=0).tolist(), strict=True))
+    seen = zip(s.speech, alpha, beta, crops(s.clip.path, track, basis.region), strict=False)
+    frames = ((a, b, real) for spoken, a, b, real in seen if spoken)
+    for a, b, real in progress(frames, label, total=total):
+        made = synthesize_batch(synthesizer, a, b)
+        errors.append((weight * (made - real) ** 2).sum(axis=(1, 2, 3)))
+    return dict(zip(kinds, np.mean(errors, axis=0).tolist(), strict=True))
 
 
 def _jitter(series: Sequence[Floats], spoken: Sequence[_Spoken]) -> float:

@@ -4,10 +4,12 @@ Images, flows and other fields are float32, C order, (..., H, W, C); the leading
 any shape, none and empty included, and broadcast against those of the other arguments. A flow is
 (..., H, W, 2) = (dx, dy) [px]. NaN and infinite values are an `InputError` that names the argument.
 
-Chains of operations that are to stay on a device use `mmmgpu.backends.get_backend` instead.
+Where a device's memory does not hold a batch, it is worked on in parts. Chains of operations that
+are to stay on a device use `mmmgpu.backends.get_backend` instead.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from mmmgpu.arrays import F32, I32, as_batch, as_float32, as_indices, broadcast_leads
 from mmmgpu.backends import Backend, get_backend
+from mmmgpu.batches import in_parts
 from mmmgpu.errors import InputError
 
 FIELD = ("...", "H", "W", "C")
@@ -43,9 +46,9 @@ def forward_warp(field: ArrayLike, flow: ArrayLike, *, backend: str = "warp") ->
     shape = (*lead, height, width)
     if not math.prod(shape) * channels:
         return np.zeros((*shape, channels), np.float32), np.zeros(shape, np.float32)
-    k = get_backend(backend)
-    warped, weight = k.forward_warp(*_on_device(k, as_batch(f, lead, 3), as_batch(q, lead, 3)))
-    return k.to_host(warped).reshape(*shape, channels), k.to_host(weight).reshape(shape)
+    given = as_batch(f, lead, 3), as_batch(q, lead, 3)
+    warped, weight = _batched(get_backend(backend), "forward_warp", given)
+    return warped.reshape(*shape, channels), weight.reshape(shape)
 
 
 def fill_holes(
@@ -79,9 +82,8 @@ def fill_holes(
         return np.zeros(shape, np.float32)
     f = np.broadcast_to(f, shape).reshape(-1, *f.shape[-3:])
     w = np.broadcast_to(w, shape[:-1]).reshape(-1, *w.shape[-2:])
-    k = get_backend(backend)
-    values, confidence = _on_device(k, f, w)
-    filled = k.to_host(k.fill_holes(values, confidence, threshold)).reshape(shape)
+    (filled,) = _batched(get_backend(backend), "fill_holes", (f, w), threshold)
+    filled = filled.reshape(shape)
     return filled.copy() if np.may_share_memory(filled, f) else filled
 
 
@@ -102,7 +104,11 @@ def blend(images: ArrayLike, weights: ArrayLike, *, backend: str = "warp") -> F3
     if not math.prod(shape) * len(i):
         return np.zeros(shape, np.float32)
     k = get_backend(backend)
-    return k.to_host(k.blend(*_on_device(k, i, w.reshape(-1, len(i))))).reshape(shape)
+
+    def mixed(part: slice) -> F32:
+        return k.to_host(k.blend(*_on_device(k, i, w.reshape(-1, len(i))[part])))
+
+    return _joined(in_parts(mixed, math.prod(w.shape[:-1]))).reshape(shape)
 
 
 def sample(field: ArrayLike, points: ArrayLike, *, backend: str = "warp") -> F32:
@@ -128,9 +134,9 @@ def sample(field: ArrayLike, points: ArrayLike, *, backend: str = "warp") -> F32
     if not math.prod(shape):
         return np.zeros(shape, np.float32)
     p = p.reshape(*p.shape[: len(own)], math.prod(free), 2)
-    k = get_backend(backend)
-    sampled = k.sample(*_on_device(k, as_batch(f, lead, 3), as_batch(p, lead, 2)))
-    return k.to_host(sampled).reshape(shape)
+    given = as_batch(f, lead, 3), as_batch(p, lead, 2)
+    (sampled,) = _batched(get_backend(backend), "sample", given)
+    return sampled.reshape(shape)
 
 
 def distance_scan(
@@ -157,7 +163,11 @@ def distance_scan(
     if not q.size * c.size:
         return np.zeros((len(q), len(c)), np.float32)
     k = get_backend(backend)
-    return k.to_host(k.distance_scan(*_on_device(k, q, c, w)))
+
+    def scanned(part: slice) -> F32:
+        return k.to_host(k.distance_scan(*_on_device(k, q, c[part], w)))
+
+    return _joined(in_parts(scanned, len(c)), axis=1)
 
 
 def evaluate_rbf(
@@ -197,9 +207,13 @@ def evaluate_rbf(
         return np.zeros(p.shape, np.float32)
     if not len(c):
         c = w = np.zeros((1, 2), np.float32)
-    k = get_backend(backend)
-    at, places, shares, plane = _on_device(k, p.reshape(-1, 2), c, w, a)
-    return k.to_host(k.evaluate_rbf(at, places, shares, plane, sharpness)).reshape(p.shape)
+    k, at = get_backend(backend), p.reshape(-1, 2)
+
+    def mapped(part: slice) -> F32:
+        here, places, shares, plane = _on_device(k, at[part], c, w, a)
+        return k.to_host(k.evaluate_rbf(here, places, shares, plane, sharpness))
+
+    return _joined(in_parts(mapped, len(at))).reshape(p.shape)
 
 
 def piecewise_warp(
@@ -238,9 +252,29 @@ def piecewise_warp(
     shape = (*lead, len(i), f.shape[-1])
     if not math.prod(shape) * f.size:
         return np.zeros(shape, np.float32)
-    k = get_backend(backend)
-    given = _on_device(k, as_batch(f, lead, 3), as_batch(v, lead, 2), t, i, b)
-    return k.to_host(k.piecewise_warp(*given)).reshape(shape)
+    given = as_batch(f, lead, 3), as_batch(v, lead, 2)
+    (warped,) = _batched(get_backend(backend), "piecewise_warp", given, t, i, b)
+    return warped.reshape(shape)
+
+
+def _batched(k: Backend, operation: str, batches: tuple[F32, ...], *same: Any) -> list[F32]:
+    """The results of an operation on arrays with a batch axis; those of one item fit any batch.
+
+    same: what else it takes: arrays and numbers that are the same for all of the batch.
+    """
+
+    def compute(part: slice) -> list[F32]:
+        parts = _on_device(k, *(a if len(a) == 1 else a[part] for a in batches))
+        others = [k.to_device(s) if isinstance(s, np.ndarray) else s for s in same]
+        result = getattr(k, operation)(*parts, *others)
+        return [k.to_host(r) for r in (result if isinstance(result, tuple) else (result,))]
+
+    done = in_parts(compute, max(map(len, batches)))
+    return [_joined(parts) for parts in zip(*done, strict=True)]
+
+
+def _joined(parts: Sequence[F32], axis: int = 0) -> F32:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis)
 
 
 def _on_device(backend: Backend, *arrays: F32 | I32) -> list[Any]:

@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from mmmgpu.analysis import analyze, prepare_analysis
 from mmmgpu.backends import default_threads, get_backend
-from mmmgpu.compositing import composite
+from mmmgpu.compositing import composite, looked_at
 from mmmgpu.models import Model
 from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.progress import progress
 from mmmgpu.sounds import check_sync, read_sound
-from mmmgpu.synthesis import synthesize_one
+from mmmgpu.synthesis import mouths, prepare_synthesis
 from mmmgpu.tracks import Track, crop, track_clip
 from mmmgpu.video_writing import write_video
 from mmmgpu.videos import probe, read_frames
 
+F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
@@ -92,12 +93,13 @@ def reconstructed_frames(
     model: Model, clip: Path, analysed: Analysed, *, backend: str = "warp"
 ) -> Iterator[NDArray[np.uint8]]:
     """The frames of `clip` with the mouth that the model makes of its coordinates."""
-    kernels, basis, track = get_backend(backend, 1), model.basis, analysed.track
+    basis, track = model.basis, analysed.track
+    synthesizer = prepare_synthesis(basis, shown=looked_at(basis.cover), backend=backend)
 
-    def one(item: tuple[Picture, Floats, Floats, Floats], _: Cancelled) -> Picture:
-        frame, pose, alpha, beta = item
-        image = synthesize_one(basis, alpha, beta, kernels)
+    def one(item: tuple[Picture, Floats, F32], _: Cancelled) -> Picture:
+        frame, pose, image = item
         return composite(frame, image, basis.cover, pose, track, basis.region)
 
-    rows = zip(read_frames(clip), track.poses, analysed.alpha, analysed.beta, strict=False)
+    images = mouths(synthesizer, analysed.alpha, analysed.beta)
+    rows = zip(read_frames(clip), track.poses, images, strict=False)
     yield from map_ordered(one, rows, threads=default_threads())

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.backends import get_backend
 from mmmgpu.figures import (
     Panel,
     curves,
@@ -29,7 +28,7 @@ from mmmgpu.parallel import one_thread_each
 from mmmgpu.phones import SIL, VISEMES, arpabet
 from mmmgpu.report_parts import PAGE, figure, pair, small, tile, videos_section
 from mmmgpu.report_tables import error_table, fact_table, lip_table, picture_table
-from mmmgpu.synthesis import synthesize_one
+from mmmgpu.synthesis import Synthesizer, prepare_synthesis, synthesize_batch
 from mmmgpu.trajectory_files import Trajectory
 
 Floats = NDArray[np.float64]
@@ -65,17 +64,18 @@ def write_report(
         InputError: The file cannot be written.
     """
     with one_thread_each():
+        synthesizer = prepare_synthesis(model.basis, backend=backend)
         sections = [
             _summary(model),
             videos_section(videos or {}, Path(path)),
             _reference(model),
             _prototypes(model),
             _flows(model),
-            _visemes(model, backend),
-            _training(model, backend),
+            _visemes(model, synthesizer),
+            _training(model, synthesizer),
             _movement(model, held_out) if held_out else "",
             _errors(evaluation) if evaluation else "",
-            _stills(model, spoken, backend) if spoken else "",
+            _stills(spoken, synthesizer) if spoken else "",
         ]
     body = "\n".join(section for section in sections if section)
     write_text(path, PAGE.format(title="A learned mouth: report", body=body))
@@ -174,14 +174,14 @@ def _flows(model: Model) -> str:
     )
 
 
-def _visemes(model: Model, backend: str) -> str:
+def _visemes(model: Model, synthesizer: Synthesizer) -> str:
     tiles = "".join(
         tile(
             image,
             f"{label} · {count}",
             alt=f"the mouth in the middle of {label}, learned from {count} frames",
         )
-        for label, count, image in _means(model, backend)
+        for label, count, image in _means(model, synthesizer)
     )
     return (
         "<h2>The mouth of each phone</h2><p>The trained mean of every phone, as the model draws "
@@ -190,13 +190,15 @@ def _visemes(model: Model, backend: str) -> str:
     )
 
 
-def _means(model: Model, backend: str) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
+def _means(
+    model: Model, synthesizer: Synthesizer
+) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
     """Every phone with its frames and its mean as a picture, in order of viseme classes."""
     order = [label for labels in VISEMES.values() for label in labels]
     known = model.alpha.trained.labels
-    for label in sorted(known, key=lambda p: _place(p, order)):
-        count = int(model.alpha.trained.count[known.index(label)])
-        yield label, count, mean_picture(model, label, backend)
+    labels = sorted(known, key=lambda p: _place(p, order))
+    counts = [int(model.alpha.trained.count[known.index(label)]) for label in labels]
+    yield from zip(labels, counts, mean_pictures(model, labels, synthesizer), strict=True)
 
 
 def _place(label: str, order: Sequence[str]) -> tuple[int, str]:
@@ -204,28 +206,31 @@ def _place(label: str, order: Sequence[str]) -> tuple[int, str]:
     return (order.index(phone) if phone in order else len(order)), label
 
 
-def mean_picture(
-    model: Model, label: str, backend: str, *, kind: str = "trained"
+def mean_pictures(
+    model: Model, labels: Sequence[str], synthesizer: Synthesizer, *, kind: str = "trained"
 ) -> NDArray[np.float32]:
-    """The mean of a phone as a picture, (h, w, 3) in [0, 1]; for `kind` see `trajectories`."""
-    alpha, beta = (m.mean[m.labels.index(label)] for m in phonemes_of(model, kind))
-    return synthesize_one(
-        model.basis, alpha, project_on_simplex(beta[None])[0], get_backend(backend)
+    """The means of phones as pictures, (n, h, w, 3) in [0, 1]; for `kind` see `trajectories`."""
+    alpha, beta = (
+        m.mean[[m.labels.index(label) for label in labels]] for m in phonemes_of(model, kind)
     )
+    return synthesize_batch(synthesizer, alpha, project_on_simplex(beta))
 
 
-def _training(model: Model, backend: str) -> str:
+def _training(model: Model, synthesizer: Synthesizer) -> str:
     alpha = model.alpha
     change = np.linalg.norm(alpha.trained.mean - alpha.pooled.mean, axis=1)
     labels = [alpha.trained.labels[i] for i in np.argsort(-change)[:CHANGES_SHOWN]]
+    before, after = (
+        mean_pictures(model, labels, synthesizer, kind=kind) for kind in ("pooled", "trained")
+    )
     pairs = "".join(
         pair(
-            small(mean_picture(model, label, backend, kind="pooled")),
-            small(mean_picture(model, label, backend)),
+            small(old),
+            small(new),
             (f"{label} before training", f"{label} after training"),
             f"{label}: before, after",
         )
-        for label in labels
+        for label, old, new in zip(labels, before, after, strict=True)
     )
     errors = {
         f"{name} (clips learned from)": stream.history.training.sum(axis=1)
@@ -312,19 +317,16 @@ def _errors(evaluation: Mapping[str, Any]) -> str:
     return text
 
 
-def _stills(model: Model, spoken: Trajectory, backend: str) -> str:
+def _stills(spoken: Trajectory, synthesizer: Synthesizer) -> str:
     """Frames in the middle of phones of what was spoken, evenly chosen."""
     middles = _middles(spoken.labels)
     chosen = [
         middles[i] for i in np.unique(np.linspace(0, len(middles) - 1, STILLS_SHOWN, dtype=int))
     ]
-    kernels = get_backend(backend)
+    images = synthesize_batch(synthesizer, spoken.alpha[chosen], spoken.beta[chosen])
     tiles = "".join(
-        tile(
-            synthesize_one(model.basis, spoken.alpha[t], spoken.beta[t], kernels),
-            f"{spoken.labels[t]} {float(t / spoken.fps):.2f} s",
-        )
-        for t in chosen
+        tile(image, f"{spoken.labels[t]} {float(t / spoken.fps):.2f} s")
+        for t, image in zip(chosen, images, strict=True)
     )
     return (
         "<h2>Speaking</h2><p>The mouth of the new sentence in the middle of some of its phones."

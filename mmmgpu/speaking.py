@@ -5,6 +5,7 @@ phones -> trajectories (Eq. 3) -> frame rate of the background -> images (Eq. 1-
 Trajectories may also come from the models of `mmmgpu.dynamics`.
 """
 
+import itertools
 import math
 import os
 from collections.abc import Iterator
@@ -15,19 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.alignments import Alignment, frame_labels
-from mmmgpu.backends import default_threads, get_backend
+from mmmgpu.backends import default_threads
 from mmmgpu.backgrounds import Background, extended, open_background
-from mmmgpu.compositing import composite_matched
+from mmmgpu.compositing import composite_matched, looked_at
 from mmmgpu.errors import InputError
 from mmmgpu.models import REGULARISED, Model, moved_by, project_on_simplex
 from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.phones import SIL
 from mmmgpu.progress import progress
-from mmmgpu.synthesis import synthesize_one
+from mmmgpu.synthesis import mouths, prepare_synthesis
 from mmmgpu.trajectory_files import Trajectory
 from mmmgpu.video_writing import write_video
 from mmmgpu.voices import Speech
 
+F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
@@ -91,8 +93,7 @@ def plan(
     Raises:
         InputError: `articulation` is outside 0.5 to 1.5; the model has no such movement.
     """
-    if not ARTICULATION[0] <= articulation <= ARTICULATION[1]:
-        raise InputError(f"articulation must be between 0.5 and 1.5, got {articulation}")
+    check_articulation(articulation)
     frames = max(1, math.ceil(alignment.duration * float(model.fps) - 1e-6))
     labels = frame_labels(alignment, frames, float(model.fps))
     alpha, beta = (
@@ -100,6 +101,12 @@ def plan(
         for y, neutral in zip(moved_by(model, labels, movement), silent_mouth(model), strict=True)
     )
     return Trajectory(tuple(labels), alpha, focused(project_on_simplex(beta)), model.fps)
+
+
+def check_articulation(factor: float) -> None:
+    """Raise InputError where `factor` is outside 0.5 to 1.5."""
+    if not ARTICULATION[0] <= factor <= ARTICULATION[1]:
+        raise InputError(f"articulation must be between 0.5 and 1.5, got {factor}")
 
 
 def focused(beta: Floats) -> Floats:
@@ -168,15 +175,17 @@ def spoken_frames(
     model: Model, trajectory: Trajectory, background: Background, *, backend: str = "warp"
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield the frames of a trajectory on a background of the same frame rate."""
-    kernels, basis, track = get_backend(backend, 1), model.basis, background.track
+    basis, track = model.basis, background.track
+    synthesizer = prepare_synthesis(basis, shown=looked_at(basis.cover), backend=backend)
 
-    def one(item: tuple[int, tuple[Picture, int]], _: Cancelled) -> Picture:
-        i, (frame, t) = item
-        image = synthesize_one(basis, trajectory.alpha[i], trajectory.beta[i], kernels)
+    def one(item: tuple[int, F32, tuple[Picture, int]], _: Cancelled) -> Picture:
+        i, image, (frame, t) = item
         rng = np.random.default_rng([i, len(trajectory)])
         pose = track.poses[t]
         return composite_matched(frame, image, basis.cover, pose, track, basis.region, rng)
 
-    pictures = enumerate(extended(background, len(trajectory)))
-    frames = map_ordered(one, pictures, threads=default_threads())
+    images = mouths(synthesizer, trajectory.alpha, trajectory.beta)
+    behind = extended(background, len(trajectory))
+    items = zip(itertools.count(), images, behind, strict=False)
+    frames = map_ordered(one, items, threads=default_threads())
     yield from progress(frames, "render", total=len(trajectory))

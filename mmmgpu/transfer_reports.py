@@ -22,7 +22,8 @@ from mmmgpu.parallel import one_thread_each
 from mmmgpu.points import PointPair, read_points
 from mmmgpu.report_parts import PAGE, figure, small, tile, videos_section
 from mmmgpu.report_tables import fact_table, table
-from mmmgpu.reports import coefficient_panels, mean_picture
+from mmmgpu.reports import coefficient_panels, mean_pictures
+from mmmgpu.synthesis import prepare_synthesis
 from mmmgpu.tracks import frame_at
 from mmmgpu.trajectory_files import Trajectory
 
@@ -190,7 +191,8 @@ def _vowels(source: Model | None, before: Model, after: Model | None, backend: s
         if model is None:
             continue
         known = [v for v in VOWELS if v in model.alpha.trained.labels]
-        tiles = "".join(tile(mean_picture(model, v, backend), f"{v}, {name}") for v in known)
+        images = mean_pictures(model, known, prepare_synthesis(model.basis, backend=backend))
+        tiles = "".join(tile(image, f"{v}, {name}") for v, image in zip(known, images, strict=True))
         rows.append(f"<div class='tiles middle'>{tiles}</div>")
     return (
         "<h2>Vowels</h2><p>The mean mouth of five vowels: the first person, the second before "

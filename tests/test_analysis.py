@@ -18,8 +18,9 @@ from mmmgpu.analysis import (
 from mmmgpu.analysis import _fit_texture as fit_texture
 from mmmgpu.analysis import _refine as refine
 from mmmgpu.backends import get_backend
+from mmmgpu.backends.planes import planes
 from mmmgpu.errors import InputError
-from mmmgpu.synthesis import synthesize_one
+from mmmgpu.synthesis import synthesize
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +31,10 @@ def kernels():
 @pytest.fixture(scope="module")
 def analyzer(basis, kernels):
     return prepare_analysis(basis, kernels)
+
+
+def picture(basis, alpha, beta):
+    return next(synthesize(basis, [alpha], [beta], backend="numpy"))
 
 
 def psnr(image, wanted, mask):
@@ -122,7 +127,7 @@ def test_alpha_is_the_ridge_regression_of_the_flow(basis, analyzer):
     for y in range(h):
         for x in range(w):
             weight = analyzer.basis.w_f[y, x]
-            if weight > 0.02:
+            if weight > 0.02 and (x + y) % 2 == 0:
                 for c in range(2):
                     own = analyzer.basis.flows[analyzer.basis.moving, y, x, c]
                     rows.append(np.sqrt(weight) * own.astype(float))
@@ -165,13 +170,13 @@ def test_a_picture_of_the_model_is_made_again(basis, analyzer, kernels, seed):
     rng = np.random.default_rng(seed)
     alpha = rng.dirichlet(np.ones(5))[1:]
     beta = rng.dirichlet(np.full(5, 0.7))
-    image = synthesize_one(basis, alpha, beta, kernels)
+    image = picture(basis, alpha, beta)
     a, b = analyze(analyzer, image)
     assert a.shape == (4,)
     assert b.shape == (5,)
     assert b.min() >= 0
     assert b.sum() == pytest.approx(1)
-    again = synthesize_one(basis, a, b, kernels)
+    again = picture(basis, a, b)
     assert psnr(again, image, basis.w_t) > 38
     neutral = basis.images[basis.reference]
     assert psnr(again, image, basis.w_t) > psnr(neutral, image, basis.w_t) + 6
@@ -180,7 +185,7 @@ def test_a_picture_of_the_model_is_made_again(basis, analyzer, kernels, seed):
 def test_prototypes_are_made_again(basis, analyzer, kernels):
     for image in basis.images:
         a, b = analyze(analyzer, image)
-        assert psnr(synthesize_one(basis, a, b, kernels), image, basis.w_t) > 36
+        assert psnr(picture(basis, a, b), image, basis.w_t) > 36
 
 
 def test_postures_between_the_prototypes_are_made(face_and_basis, analyzer, kernels):
@@ -190,7 +195,7 @@ def test_postures_between_the_prototypes_are_made(face_and_basis, analyzer, kern
     )
     for image in mouth_pictures(face, new, basis.region)[1:]:
         a, b = analyze(analyzer, image)
-        made = psnr(synthesize_one(basis, a, b, kernels), image, basis.w_t)
+        made = psnr(picture(basis, a, b), image, basis.w_t)
         nearest = max(psnr(p, image, basis.w_t) for p in basis.images)
         assert made > 28
         assert made > nearest + 2
@@ -209,12 +214,12 @@ def test_a_step_lowers_the_difference_of_the_pictures(basis, analyzer, kernels, 
     rng = np.random.default_rng(seed)
     beta = rng.dirichlet(np.ones(5))
     alpha = rng.dirichlet(np.ones(5))[1:]
-    image = synthesize_one(basis, alpha, beta, kernels)[analyzer.inside]
+    image = picture(basis, alpha, beta)[analyzer.inside]
     start = alpha + 0.12 * rng.normal(size=4)
     everything = np.arange(5)
 
     def error(a):
-        _, made = fit_texture(analyzer, image, analyzer.basis.flow(a), everything)
+        _, made = fit_texture(analyzer, planes(image), analyzer.basis.flow(a), everything)
         return -psnr(made, image, analyzer.basis.w_f), made
 
     before, made = error(start)
@@ -225,7 +230,7 @@ def test_a_step_lowers_the_difference_of_the_pictures(basis, analyzer, kernels, 
 def test_a_step_from_the_truth_stays(basis, analyzer, kernels):
     alpha = np.array([0.2, 0.3, 0.1, 0.1])
     beta = np.array([0.2, 0.3, 0.2, 0.2, 0.1])
-    image = synthesize_one(basis, alpha, beta, kernels)[analyzer.inside]
+    image = picture(basis, alpha, beta)[analyzer.inside]
     stepped = refine(analyzer, image, alpha, analyzer.basis.flow(alpha), image)
     np.testing.assert_allclose(stepped, alpha, atol=0.02)
 

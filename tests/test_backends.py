@@ -229,10 +229,12 @@ def test_a_damaged_pocl_cache_is_not_read(tmp_path):
     assert run(ONE_OPERATION, "opencl", POCL_CACHE_DIR=str(tmp_path)) == whole
 
 
-def test_first_use_by_several_processes_at_once(backend, tmp_path):
+def test_first_use_by_four_processes_at_once_with_an_empty_cache(backend, tmp_path):
     setup = WARP_CACHE if backend == "warp" else ""
-    with ThreadPoolExecutor(3) as pool:
-        answers = set(pool.map(lambda _: run(setup + ONE_OPERATION, backend, tmp_path), range(3)))
+    with ThreadPoolExecutor(4) as pool:
+        place = {"XDG_CACHE_HOME": str(tmp_path)}
+        program = setup + ONE_OPERATION
+        answers = set(pool.map(lambda _: run(program, backend, tmp_path, **place), range(4)))
     assert len(answers) == 1
 
 

@@ -23,7 +23,7 @@ from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
 
 COMMANDS = ("demo", "align", "train", "reconstruct", "speak", "evaluate")
-COMMANDS += ("mark", "transfer", "adapt", "aam", "track", "compare", "info")
+COMMANDS += ("mark", "transfer", "adapt", "aam", "track", "bench", "compare", "info")
 SLOW = {"av", "cv2", "matplotlib", "numpy", "rich", "scipy", "sklearn", "warp"}
 
 

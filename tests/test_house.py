@@ -35,12 +35,15 @@ LAYERS = {
     "mmmgpu.kernels": 0,
     "mmmgpu.errors": 1,
     "mmmgpu.arrays": 1,
+    "mmmgpu.files": 1,
     "mmmgpu.backends": 1,
+    "mmmgpu.bench.__main__": 3,
     "mmmgpu.cli": 3,
     "mmmgpu.commands": 3,
     "mmmgpu.__main__": 3,
 }
 DOMAIN = 2  # every other module
+SHARED = {"mmmgpu.kernels.lanes", "mmmgpu.kernels.pyramid"}  # functions of several kernels
 
 
 def tracked_files():
@@ -56,13 +59,14 @@ def tracked_files():
 
 
 TRACKED = tracked_files()
-MODULES = [*ROOT.glob("kernels/*.py"), *ROOT.glob("mmmgpu/**/*.py")]
+OUTSIDE = ("bench", "kernels")  # folders that are installed as mmmgpu.NAME
+MODULES = [p for name in (*OUTSIDE, "mmmgpu") for p in ROOT.glob(f"{name}/**/*.py")]
 
 
 def module_name(path):
     """The name under which a source file is imported."""
     parts = path.relative_to(ROOT).with_suffix("").parts
-    parts = ("mmmgpu", *parts) if parts[0] == "kernels" else parts
+    parts = ("mmmgpu", *parts) if parts[0] in OUTSIDE else parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
@@ -86,9 +90,9 @@ def layer(name):
 
 
 def upward(source, name):
-    """What `name` imports from above its layer; for a kernel, all but Warp."""
+    """What `name` imports from above its layer; for a kernel, all but Warp and shared functions."""
     for target in imports(source, name):
-        if layer(name) == 0 and target != "warp":
+        if layer(name) == 0 and target not in {"warp", *SHARED}:
             yield target
         if target.partition(".")[0] == "mmmgpu" and layer(target) > layer(name):
             yield target

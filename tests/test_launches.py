@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
 
 from mmmgpu.backends import get_backend
+from mmmgpu.backends.planes import planes
 from mmmgpu.errors import InputError
 
 HOLE = 0.1
@@ -21,27 +22,27 @@ def prototypes(name, size, seed=0):
     return rng.random((NUMBER, *size, 3), dtype=np.float32), flows
 
 
-def placed(size, pixels):
-    """Each of `pixels` goes to its position in the list, all others nowhere."""
-    places = np.full(size[0] * size[1], -1, np.int32)
-    places[list(pixels)] = np.arange(len(pixels))
-    return places.reshape(size)
+def some_of(size, rng):
+    """A scale (h, w) between 0 and 1 that asks for about half of the pixels, and for the first."""
+    scale = np.float32(rng.random(size) * (rng.random(size) < 0.5))
+    scale[0, 0] = 0.7
+    return scale
 
 
-def moved(name, images, flows, flow, used, pixels, scale=None, threads=None):
-    k, size = get_backend(name, threads), images.shape[1:3]
+def moved(name, images, flows, flow, used, scale, threads=None):
+    k = get_backend(name, threads)
     held = k.hold_prototypes(images, flows, HOLE)
-    scale = np.ones(size) if scale is None else scale
-    given = flow, np.int32(used), placed(size, pixels), np.float32(scale)
-    return k.to_host(k.move_prototypes(held, *map(k.to_device, given), len(pixels)))
+    given = planes(flow[None]), np.int32(used), planes(scale[..., None])[0]
+    made = k.to_host(k.move_prototypes(held, *map(k.to_device, given)))
+    return np.moveaxis(made[..., : images.shape[2]], 1, -1)
 
 
-def mixed(name, images, flows, wanted, weights, pixels, scale=None, threads=None):
-    k, size = get_backend(name, threads), images.shape[1:3]
+def mixed(name, images, flows, wanted, weights, scale, threads=None):
+    k = get_backend(name, threads)
     held = k.hold_prototypes(images, flows, HOLE)
-    scale = np.ones(size) if scale is None else scale
-    given = wanted, np.float32(weights), placed(size, pixels), np.float32(scale)
-    return k.to_host(k.mix_prototypes(held, *map(k.to_device, given), len(pixels)))
+    given = planes(wanted), np.float32(weights), planes(scale[..., None])[0]
+    made = k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
+    return np.moveaxis(made[..., : images.shape[2]], 1, -1)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -50,9 +51,7 @@ def mixed(name, images, flows, wanted, weights, pixels, scale=None, threads=None
 def test_moved_prototypes(backend, own, to, size):
     images, flows = prototypes(own, size)
     flow = FLOWS[to](np.random.default_rng(3), *size)
-    rng = np.random.default_rng(4)
-    pixels, scale = rng.permutation(size[0] * size[1])[::2], rng.random(size)
-    given = images, flows, flow, [2, 0, 1, 2], pixels, scale
+    given = images, flows, flow, [2, 0, 1, 2], some_of(size, np.random.default_rng(4))
     try:
         desired = moved("numpy", *given)
     except InputError:
@@ -70,51 +69,46 @@ def test_mixed_prototypes(backend, own, size):
     weights = rng.dirichlet(np.ones(NUMBER), 4)
     weights[1, 0] = 0
     wanted = np.einsum("bm,mhwc->bhwc", rng.normal(0, 0.5, (4, NUMBER)), flows).astype(np.float32)
-    pixels = rng.permutation(size[0] * size[1])[::2]
-    given = images, flows, wanted, weights, pixels, rng.random(size)
+    given = images, flows, wanted, weights, some_of(size, rng)
     desired = mixed("numpy", *given)
     assert_allclose(mixed(backend, *given), desired, rtol=0, atol=1e-4)
 
 
 def test_the_reference_mixes_what_it_moves():
     images, flows = prototypes("random", (9, 12))
-    weights, pixels = np.float32([[0.2, 0.5, 0.3]]), np.arange(10, 60, 3)
-    apart = moved("numpy", images, flows, flows[2], range(NUMBER), pixels)
-    together = mixed("numpy", images, flows, flows[2:], weights, pixels)
+    weights, scale = np.float32([[0.2, 0.5, 0.3]]), some_of((9, 12), np.random.default_rng(7))
+    apart = moved("numpy", images, flows, flows[2], range(NUMBER), scale)
+    together = mixed("numpy", images, flows, flows[2:], weights, scale)
     assert_allclose(together[0], np.tensordot(weights[0], apart, axes=1), rtol=0, atol=1e-6)
 
 
 def test_a_prototype_without_weight_is_not_looked_at(backend):
     images, flows = prototypes("random", (9, 12))
     other = images.copy()
-    other[1] = np.nan
-    weights, pixels = [[0.4, 0, 0.6], [0.0, 0.0, 0.0]], np.arange(9 * 12)
+    other[1] = 1 - other[1]
+    weights, scale = [[0.4, 0, 0.6], [0.0, 0.0, 0.0]], np.ones((9, 12), np.float32)
     wanted = np.stack([flows[2], flows[1]])
-    pictures = mixed(backend, images, flows, wanted, weights, pixels)
-    assert_array_equal(mixed(backend, other, flows, wanted, weights, pixels), pictures)
-    assert_array_equal(pictures[1], 0)
+    seen = mixed(backend, images, flows, wanted, weights, scale)
+    assert_array_equal(mixed(backend, other, flows, wanted, weights, scale), seen)
+    assert_array_equal(seen[1], 0)
 
 
-@pytest.mark.parametrize(("frames", "pixels"), [(0, 5), (2, 0), (0, 0)])
-def test_nothing_asked_gives_nothing(backend, frames, pixels):
+@pytest.mark.parametrize("frames", [0, 2])
+def test_nothing_asked_gives_nothing(backend, frames):
     images, flows = prototypes("random", (5, 4))
-    wanted, weights = flows[:frames], np.ones((frames, NUMBER))
-    assert mixed(backend, images, flows, wanted, weights, range(pixels)).shape == (
-        frames,
-        pixels,
-        3,
-    )
-    empty = moved(backend, images, flows, flows[1], [], range(pixels))
-    assert empty.shape == (0, pixels, 3)
+    wanted, weights, scale = flows[:frames], np.ones((frames, NUMBER)), np.zeros((5, 4), np.float32)
+    seen = mixed(backend, images, flows, wanted, weights, scale)
+    assert_array_equal(seen, np.zeros((frames, 5, 4, 3)))
+    assert moved(backend, images, flows, flows[1], [], scale).shape == (0, 5, 4, 3)
 
 
 def test_any_number_of_threads_gives_the_same_bits(backend):
     images, flows = prototypes("tearing", (33, 64))
-    wanted, pixels = flows[::-1].copy(), np.arange(33 * 64)
+    wanted, scale = flows[::-1].copy(), np.ones((33, 64), np.float32)
     weights = np.random.default_rng(6).random((NUMBER, NUMBER))
     for run, given in (
-        (mixed, (wanted, weights, pixels)),
-        (moved, (wanted[0], [0, 1, 2], pixels)),
+        (mixed, (wanted, weights, scale)),
+        (moved, (wanted[0], [0, 1, 2], scale)),
     ):
         one, *others = (run(backend, images, flows, *given, threads=n) for n in (1, 2, 5))
         for other in others:
@@ -123,8 +117,8 @@ def test_any_number_of_threads_gives_the_same_bits(backend):
 
 def test_a_prototype_that_leaves_the_picture_is_an_error(backend):
     images, flows = prototypes("zero", (6, 6))
-    gone = np.full((6, 6, 2), 50, np.float32)
+    gone, scale = np.full((6, 6, 2), 50, np.float32), np.ones((6, 6), np.float32)
     with pytest.raises(InputError, match="no pixel"):
-        moved(backend, images, flows, gone, [0], [1])
+        moved(backend, images, flows, gone, [0], scale)
     with pytest.raises(InputError, match="no pixel"):
-        mixed(backend, images, flows, np.stack([flows[0], gone]), np.ones((2, NUMBER)), [1])
+        mixed(backend, images, flows, np.stack([flows[0], gone]), np.ones((2, NUMBER)), scale)

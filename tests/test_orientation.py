@@ -3,7 +3,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
 
-from mmmgpu.backends.orientation import OWN_ROW, TAPS, orient
+from mmmgpu.backends.orientation import orient
+from mmmgpu.backends.planes import LANES, picture, pitch_of
 from mmmgpu.errors import InputError
 from mmmgpu.operations import fill_holes, forward_warp
 
@@ -12,23 +13,31 @@ STAYING = sorted(set(FLOWS) - {"leaving"})
 
 
 def applied(o, i, field):
-    """L_i of a field (h w, C): the regular pixels, then the rows one after the other."""
-    nodes = np.zeros((o.nodes, field.shape[1]))
-    nodes[: len(field)] = field
-    result = np.full(field.shape, np.nan)
-    regular = o.taps[i, :, 0] != OWN_ROW
-    for s in np.flatnonzero(regular):
-        result[s] = o.shares[i, s].astype(float) @ nodes[o.taps[i, s]]
+    """L_i of a picture (h, w, C): the parts of each vector, then the rows one after the other."""
+    h, w, channels = field.shape
+    pitch = pitch_of(w)
+    area = h * pitch
+    nodes = np.zeros((LANES + o.nodes, channels))
+    pixels, cells = nodes[LANES : LANES + area], nodes[LANES:]
+    pixels.reshape(h, pitch, channels)[:, :w] = field
+    result = np.zeros((area, channels))
+    vectors = area // LANES
+    for v in range(vectors):
+        for k in range(o.firsts[i * vectors + v], o.firsts[i * vectors + v + 1]):
+            at = LANES + LANES * v + o.deltas[k]
+            result[LANES * v : LANES * (v + 1)] += (
+                o.shares[k].astype(float)[:, None] * nodes[at : at + LANES]
+            )
     for row in range(o.rows[i], o.rows[i + 1]):
         span = slice(o.starts[row], o.starts[row + 1])
-        mean = o.row_shares[span].astype(float) @ nodes[o.row_taps[span]]
+        mean = o.row_shares[span].astype(float) @ cells[o.row_taps[span]]
         target = o.targets[row]
-        if target < len(field):
-            assert not regular[target]
+        if target < area:
+            assert not result[target].any()
             result[target] = mean
         else:
-            nodes[target] = mean
-    return result
+            cells[target] = mean
+    return result.reshape(h, pitch, channels)[:, :w]
 
 
 def make_flows(name, size):
@@ -50,8 +59,7 @@ def test_it_is_the_filled_forward_warp(name, size):
     warped, weight = forward_warp(field, flows, backend="numpy")
     desired = fill_holes(warped, weight, threshold=HOLE, backend="numpy")
     for i in range(2):
-        actual = applied(o, i, field[i].reshape(-1, 2))
-        assert_allclose(actual, desired[i].reshape(-1, 2), rtol=0, atol=1e-5)
+        assert_allclose(applied(o, i, field[i]), desired[i], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["constant", "random", "tearing"])
@@ -59,24 +67,27 @@ def test_what_is_fixed_is_the_flow_carried_along_itself(name):
     flows = make_flows(name, (33, 20))
     o = orient(flows, HOLE)
     for i in range(2):
-        carried = applied(o, i, flows[i].reshape(-1, 2))
-        assert_allclose(o.fixed[i], carried, rtol=0, atol=1e-5)
+        fixed = picture(o.fixed[i], 20)
+        assert_allclose(fixed, applied(o, i, flows[i]), rtol=0, atol=1e-5)
 
 
 def test_pixels_that_stay_need_no_rows():
-    o = orient(np.zeros((1, 5, 7, 2), np.float32), HOLE)
+    o = orient(np.zeros((1, 5, 20, 2), np.float32), HOLE)
     assert len(o.targets) == 0
-    assert o.nodes == 35
-    assert_array_equal(o.taps[0, :, 0], np.arange(35))
-    assert o.taps.min() >= 0
-    assert o.taps.max() < 35
-    assert_array_equal(o.shares[0], np.eye(TAPS)[:1].repeat(35, axis=0))
-    assert_array_equal(o.fixed, 0)
+    assert_array_equal(o.firsts, np.arange(5 * 2 + 1))
+    assert_array_equal(o.deltas, 0)
+    assert_array_equal(o.shares, np.tile(np.float32(np.arange(32) < 20), 5).reshape(10, LANES))
+    assert_array_equal(o.fixed[..., :20], 0)
+
+
+def test_what_pads_a_row_is_carried_out_of_any_picture():
+    o = orient(np.zeros((1, 5, 20, 2), np.float32), HOLE)
+    assert o.fixed[..., 20:].min() > 1e8
 
 
 def test_shares_of_every_pixel_add_up_to_one():
     o = orient(make_flows("random", (33, 20)), HOLE)
-    carried = applied(o, 1, np.ones((33 * 20, 1)))
+    carried = applied(o, 1, np.ones((33, 20, 1)))
     assert_allclose(carried, 1, rtol=0, atol=1e-6)
 
 

@@ -59,25 +59,21 @@ class Backend(Protocol):
         """(P, 2), (N, 2), (N, 2), (2, 3) -> (P, 2)."""
 
     def hold_prototypes(self, images: F32, flows: F32, hole: float, /) -> Any:
-        """NumPy (M, H, W, 3), (M, H, W, 2): all of them that stays the same, on the device.
+        """NumPy (M, H, W, 3) in [0, 1], (M, H, W, 2): all that stays the same, on the device.
 
         A pixel that receives less weight than `hole` in one of the two warps of CE05, Eq. 2, is
         filled.
         """
 
-    def move_prototypes(
-        self, held: Any, flow: Any, used: Any, places: Any, scale: Any, asked: int, /
-    ) -> Any:
-        """Some of what `hold_prototypes` gave, each moved along C_syn as in CE05, Eq. 2.
+    def move_prototypes(self, held: Any, flow: Any, used: Any, scale: Any, /) -> Any:
+        """Some of what `hold_prototypes` gave, each moved along C_syn as in CE05, Eq. 2, scaled.
 
-        (H, W, 2), (n,) int32, (H, W) int32, (H, W) -> (n, P, 3). A pixel goes to its place, one of
-        the P = `asked` or -1 for none, times its scale.
+        (1, 2, H, P), (n,) int32, (H, P) -> (n, 3, H, P): planes, see `mmmgpu.backends.planes`.
+        Where the scale is 0 nothing is filled.
         """
 
-    def mix_prototypes(
-        self, held: Any, flows: Any, weights: Any, places: Any, scale: Any, asked: int, /
-    ) -> Any:
-        """CE05, Eq. 2: (B, H, W, 2), (B, M), (H, W) int32, (H, W) -> (B, P, 3).
+    def mix_prototypes(self, held: Any, flows: Any, weights: Any, scale: Any, /) -> Any:
+        """CE05, Eq. 2, scaled: (B, 2, H, P), (B, M), (H, P) -> (B, 3, H, P).
 
         A prototype costs nothing where its weight is 0; else as `move_prototypes`.
         """

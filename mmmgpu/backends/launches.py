@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends.orientation import orient
+from mmmgpu.backends.planes import LANES, pitch_of, planes
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
-LANES = 16  # floats of a vector, as in kernels/blend, distance_scan and rbf
+COLOURS = 3  # channels of a picture, as in kernels/sample
+RUN = 16  # points of a thread, as in kernels/sample
+WHITE = 65535  # of a texture, as in kernels/prototypes
 TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
 
 
@@ -135,8 +138,11 @@ class Launches(ABC):
         sets, number, _ = points.shape
         batch = max(fields, sets)
         sampled = self.empty(batch, number, channels)
-        inputs = [field, points, fields, sets, number, height, width, channels]
-        self.launch_all("sample.sample", batch * number, inputs, [sampled])
+        inputs, runs = [field, points, fields, sets, number, height, width], math.ceil(number / RUN)
+        if channels == COLOURS:
+            self.launch_all("sample.sample_pictures", batch * runs, inputs, [sampled])
+        else:
+            self.launch_all("sample.sample", batch * runs, [*inputs, channels], [sampled])
         return sampled
 
     def distance_scan(self, queries: Any, corpus: Any, weights: Any) -> Any:
@@ -146,15 +152,15 @@ class Launches(ABC):
         shares = self._packed(weights, points, 1, 0, 1)
         distance = self.empty(number, rows)
         pairs = math.ceil(number / 2)
-        sizes = [number, rows, math.ceil(points / LANES), channels]
 
         def scan(first: int, count: int) -> None:
             for start in range(first, first + count, TILE):
                 tile = min(TILE, first + count - start)
                 planes = self._packed(corpus, points, channels, start, tile)
+                sizes = [number, rows, start, tile, math.ceil(points / LANES), channels]
                 inputs = [packed, planes, shares, *sizes]
-                span = start * pairs, tile * pairs
-                self.launch("distance_scan.distance_scan", *span, inputs, [distance])
+                blocks = pairs * math.ceil(tile / 2)
+                self.launch("distance_scan.distance_scan", 0, blocks, inputs, [distance])
 
         self.split(rows, scan)
         return distance
@@ -171,54 +177,42 @@ class Launches(ABC):
     def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
         number, height, width, _ = images.shape
         held = orient(flows, hole)
-        padded = np.ones((number, height, width, 4), np.float32)
-        padded[..., :3] = images
-        fixed = held.fixed, held.taps, held.shares
+        textures = planes(np.rint(images * WHITE).astype(np.uint16))
+        parts = held.fixed, held.firsts, held.deltas, held.shares
         rows = held.rows, held.targets, held.starts, held.row_taps, held.row_shares
-        arrays = tuple(self.to_device(a) for a in (padded, *fixed, *rows))
+        arrays = tuple(self.to_device(a) for a in (textures, *parts, *rows))
         return Prototypes(arrays, number, height, width, held.nodes, float(hole))
 
-    def move_prototypes(
-        self, held: Prototypes, flow: Any, used: Any, places: Any, scale: Any, asked: int
-    ) -> Any:
+    def move_prototypes(self, held: Prototypes, flow: Any, used: Any, scale: Any) -> Any:
         members = self.to_host(used)
         alone = [np.arange(len(members) + 1), members, np.ones(len(members))]
-        return self._mixtures(held, flow, 1, alone, [places, scale], asked)
+        return self._mixtures(held, flow, 1, alone, scale)
 
-    def mix_prototypes(
-        self, held: Prototypes, flows: Any, weights: Any, places: Any, scale: Any, asked: int
-    ) -> Any:
+    def mix_prototypes(self, held: Prototypes, flows: Any, weights: Any, scale: Any) -> Any:
         shares = self.to_host(weights)
         parts = np.concatenate([[0], np.cumsum(np.count_nonzero(shares, axis=1))])
         members = [parts, np.nonzero(shares)[1], shares[shares != 0]]
-        return self._mixtures(held, flows, len(shares), members, [places, scale], asked)
+        return self._mixtures(held, flows, len(shares), members, scale)
 
     def _mixtures(
-        self,
-        held: Prototypes,
-        flows: Any,
-        frames: int,
-        members: list[Any],
-        where: list[Any],
-        asked: int,
+        self, held: Prototypes, flows: Any, frames: int, members: list[Any], scale: Any
     ) -> Any:
         """Run kernels/prototypes with an accumulator for every worker."""
-        mixtures, area = len(members[0]) - 1, held.height * held.width
-        mixed = self.empty(mixtures, asked, 3)
-        if not mixtures * asked:
+        mixtures, pitch = len(members[0]) - 1, pitch_of(held.width)
+        mixed = self.empty(mixtures, 3, held.height, pitch)
+        if not mixtures:
             return mixed
         workers = min(self.workers, mixtures)
         size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
         arrived = self.empty(mixtures, dtype=np.int32)
         given = zip(members, (np.int32, np.int32, np.float32), strict=True)
-        inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), *where]
-        inputs += [frames, mixtures, asked, held.height, held.width, size, held.nodes, held.hole]
-        inputs.append(workers)
+        inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
+        inputs += [frames, mixtures, held.height, held.width, size, held.nodes, held.hole, workers]
         outputs = [
-            self.empty(workers, area, 4),
-            self.empty(workers, size, 4),
-            self.empty(workers, area, dtype=np.int32),
-            self.empty(workers, held.nodes, 2),
+            self.empty(workers, 4, held.height * pitch + 2 * (pitch + 2 * LANES)),
+            self.empty(workers, 4, size),
+            self.empty(workers, 2, held.nodes),
+            self.empty(workers, 2, held.height, pitch),
             mixed,
             arrived,
         ]
@@ -271,9 +265,9 @@ class Launches(ABC):
 
 
 def _pyramid(height: int, width: int) -> int:
-    """Pixels of all levels of a picture, each half as high and wide as the one before."""
-    size = height * width
+    """Pixels of all levels of a picture, each half as high and wide, in padded rows."""
+    size = height * pitch_of(width)
     while (height, width) != (1, 1):
         height, width = (height + 1) // 2, (width + 1) // 2
-        size += height * width
+        size += height * pitch_of(width)
     return size

@@ -4,16 +4,15 @@ A Warp launch on the CPU is one serial loop that releases the GIL, so the items 
 cut into one contiguous part a thread. No two parts ever write to one place.
 """
 
-import ctypes
 import functools
 import importlib
 import itertools
 import os
 import shutil
-import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -24,9 +23,11 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
-from mmmgpu.errors import InputError
+from mmmgpu.backends.memory import keep_freed_memory
+from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+NO_MEMORY = "Failed to allocate"  # what Warp says
+GONE = "CUDA error", "Failed to synchronize"
 
 
 def open_backend(device: str, threads: int) -> "Warp":
@@ -38,7 +39,7 @@ def open_backend(device: str, threads: int) -> "Warp":
         present = ", ".join(f"warp:{d.alias}" for d in wp.get_devices())
         raise InputError(f"there is no device 'warp:{device}'; present: {present}") from None
     if found.is_cpu:
-        _keep_freed_memory()
+        keep_freed_memory()
         return Warp(workers=threads, device="cpu", threads=threads)
     return Warp(workers=GPU_WORKERS, device=found.alias, threads=1)
 
@@ -63,16 +64,29 @@ def _start() -> None:
         os.close(nothing)
 
 
-def _keep_freed_memory() -> None:
-    """Let the C library reuse large blocks, for Warp has no memory pool on the CPU.
+@contextmanager
+def _faults_of(device: str) -> Iterator[None]:
+    """Say in one line what a device failed at.
 
-    Otherwise the arrays of every frame are fresh pages, a quarter of a frame's time. Blocks above
-    32 MiB still go back at once, and so does what is free beyond 256 MiB.
+    Raises:
+        DeviceMemoryError, DeviceError: In place of Warp's error; what can only be a defect of ours
+            passes as it is.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
-        mallopt(M_MMAP_THRESHOLD, 32 << 20)
-        mallopt(M_TRIM_THRESHOLD, 256 << 20)
+    try:
+        yield
+    except RuntimeError as error:
+        said = " ".join(str(error).split())
+        if NO_MEMORY in said:
+            raise DeviceMemoryError(
+                f"warp:{device}: not enough memory ({said}); give smaller pictures, or choose "
+                "another device with --backend"
+            ) from error
+        if any(words in said for words in GONE):
+            raise DeviceError(
+                f"warp:{device}: the device failed ({said}); if it is still there, run the same "
+                "again, else choose another with --backend"
+            ) from error
+        raise
 
 
 @dataclass(frozen=True)
@@ -84,19 +98,24 @@ class Warp(Launches):
 
     def to_device(self, array: NDArray[Any]) -> Any:
         # a strided array would come with its strides, which the launches do not look at
-        return wp.array(np.ascontiguousarray(array), device=self.device, copy=False)
+        with _faults_of(self.device):
+            return wp.array(np.ascontiguousarray(array), device=self.device, copy=False)
 
     def to_host(self, array: Any) -> F32:
-        host: F32 = array.numpy()
+        with _faults_of(self.device):
+            wp.synchronize_device(self.device)  # a copy from a device that failed says nothing
+            host: F32 = array.numpy()
         return host
 
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
         scalar = cast(Any, wp).dtype_from_numpy(dtype)
-        return wp.empty(shape, dtype=scalar, device=self.device)
+        with _faults_of(self.device):
+            return wp.empty(shape, dtype=scalar, device=self.device)
 
     def copy(self, target: Any, source: Any, first: int, count: int) -> None:
         size = source.size // source.shape[0]
-        wp.copy(target, source, first * size, first * size, count * size)
+        with _faults_of(self.device):
+            wp.copy(target, source, first * size, first * size, count * size)
 
     def launch(
         self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
@@ -105,7 +124,8 @@ class Warp(Launches):
         given = [*inputs, first, count, *outputs]
         arguments = [_as_declared(a, t) for a, t in zip(given, types, strict=True)]
         block = _block(self.device)
-        wp.launch(compiled, dim=count, inputs=arguments, device=self.device, block_dim=block)
+        with _faults_of(self.device):
+            wp.launch(compiled, dim=count, inputs=arguments, device=self.device, block_dim=block)
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         edges = np.linspace(0, count, min(self.threads, count) + 1).astype(int).tolist()

@@ -6,6 +6,7 @@ sizes are fixed, for PoCL compiles a kernel anew for each.
 
 import functools
 import os
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,21 +20,39 @@ import pyopencl.array
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
+from mmmgpu.backends import default_threads
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.memory import keep_freed_memory
+from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
-from mmmgpu.errors import InputError
+from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
 
 LOCAL = 16  # work-items of a group; 1 where there are too few to go round
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # PoCL before and after 4.0
-NO_CACHE = {"POCL_KERNEL_CACHE": "0"}  # a damaged entry would abort the process
+NO_PLATFORM = (
+    "there is no OpenCL driver; pip install 'pyopencl[pocl]' brings one for the CPU, "
+    "or use --backend warp"
+)
+NO_MEMORY = {
+    cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
+    cl.status_code.OUT_OF_HOST_MEMORY,
+    cl.status_code.OUT_OF_RESOURCES,
+    cl.status_code.INVALID_BUFFER_SIZE,
+}
+GONE = {
+    cl.status_code.DEVICE_NOT_AVAILABLE,
+    cl.status_code.DEVICE_NOT_FOUND,
+    cl.status_code.EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST,
+    cl.status_code.INVALID_COMMAND_QUEUE,
+    cl.status_code.INVALID_CONTEXT,
+    cl.status_code.INVALID_DEVICE,
+}
+INCLUDED = re.compile(r'^#include "(\w+\.cl)"$', re.MULTILINE)
 
 
 def open_backend(device: str, threads: int) -> "OpenCL":
     """The backend on an OpenCL device: "" for the first CPU (else the first of all), or "0:0"."""
-    name_unknown_cpu()
-    with _defaults(dict.fromkeys(THREADS, str(threads)) | NO_CACHE):  # read when a driver loads
-        platforms = [p.get_devices() for p in cl.get_platforms()]
-    present = {f"{i}:{j}": d for i, found in enumerate(platforms) for j, d in enumerate(found)}
+    present = _present(threads)
     cpus = [name for name, d in present.items() if d.type & cl.device_type.CPU]
     chosen = device or next(iter([*cpus, *present]), "")
     if chosen not in present:
@@ -44,7 +63,43 @@ def open_backend(device: str, threads: int) -> "OpenCL":
         raise InputError(f"device 'opencl:{chosen}' has no float64; choose another")
     queue = cl.CommandQueue(cl.Context([found]))
     on_cpu = bool(found.type & cl.device_type.CPU)
-    return OpenCL(found.max_compute_units if on_cpu else GPU_WORKERS, queue)
+    if on_cpu:
+        keep_freed_memory()
+    workers = found.max_compute_units if on_cpu else GPU_WORKERS
+    return OpenCL(workers, f"opencl:{chosen}", queue)
+
+
+def list_devices() -> dict[str, str]:
+    """Names for `get_backend` and what they stand for."""
+    present = _present(default_threads())
+    return {f"opencl:{name}": f"{d.name}, {d.version}" for name, d in present.items()}
+
+
+def _present(threads: int) -> dict[str, Any]:
+    """OpenCL devices by platform and device number. The first call loads the drivers.
+
+    Raises:
+        InputError: There is no driver.
+    """
+    name_unknown_cpu()
+    with _defaults(dict.fromkeys(THREADS, str(threads)) | _cache()):  # read when a driver loads
+        try:
+            platforms = cl.get_platforms()
+        except cl.LogicError:
+            raise InputError(NO_PLATFORM) from None
+        found = [_devices(platform) for platform in platforms]
+    return {f"{i}:{j}": d for i, devices in enumerate(found) for j, d in enumerate(devices)}
+
+
+_cache = functools.cache(cache_variables)
+
+
+def _devices(platform: Any) -> list[Any]:
+    """The devices of a platform: none where its driver finds no hardware."""
+    try:
+        return list(platform.get_devices())
+    except cl.Error:
+        return []
 
 
 @contextmanager
@@ -59,46 +114,63 @@ def _defaults(variables: dict[str, str]) -> Iterator[None]:
             del os.environ[name]
 
 
-def list_devices() -> dict[str, str]:
-    """Names for `get_backend` and what they stand for."""
-    return {f"opencl:{name}": f"{d.name}, {d.version}" for name, d in _present().items()}
+@contextmanager
+def _faults_of(device: str) -> Iterator[None]:
+    """Say in one line what a driver failed at.
 
-
-def _present() -> dict[str, Any]:
-    """OpenCL devices by platform and device number. The first call loads the drivers."""
-    os.environ.setdefault("POCL_KERNEL_CACHE", "0")  # a damaged entry would abort the process
-    name_unknown_cpu()
-    return {
-        f"{i}:{j}": device
-        for i, platform in enumerate(cl.get_platforms())
-        for j, device in enumerate(platform.get_devices())
-    }
+    Raises:
+        DeviceMemoryError, DeviceError: In place of the driver's error; what can only be a defect of
+            ours passes as it is.
+    """
+    try:
+        yield
+    except cl.Error as error:
+        said = " ".join(str(error).split())
+        if error.code in NO_MEMORY:
+            raise DeviceMemoryError(
+                f"{device}: not enough memory ({said}); give smaller pictures, or choose another "
+                "device with --backend"
+            ) from error
+        if error.code in GONE:
+            raise DeviceError(
+                f"{device}: the device failed ({said}); if it is still there, run the same again, "
+                "else choose another with --backend"
+            ) from error
+        raise
 
 
 @dataclass(frozen=True)
 class OpenCL(Launches):
     """Device arrays are `pyopencl.array.Array`."""
 
+    name: str  # for `get_backend`
     queue: Any
 
     def to_device(self, array: NDArray[Any]) -> Any:
         if not array.size:  # there are no empty buffers
             return self.empty(*array.shape, dtype=array.dtype)
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
-        data = cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(array))
+        with _faults_of(self.name):
+            data = cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(array))
         return cl.array.Array(self.queue, array.shape, array.dtype, data=data)
 
     def to_host(self, array: Any) -> F32:
-        host: F32 = array.get()
-        return host
+        if not array.size:
+            return np.empty(array.shape, array.dtype)
+        flags, shape = cl.map_flags.READ, array.shape
+        with _faults_of(self.name):
+            host, _ = cl.enqueue_map_buffer(self.queue, array.data, flags, 0, shape, array.dtype)
+        return np.asarray(host)
 
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
-        return cl.array.empty(self.queue, shape, dtype)
+        with _faults_of(self.name):
+            return cl.array.empty(self.queue, shape, dtype)
 
     def copy(self, target: Any, source: Any, first: int, count: int) -> None:
         row = source.strides[0]
         span = {"src_offset": first * row, "dst_offset": first * row, "byte_count": count * row}
-        cl.enqueue_copy(self.queue, target.data, source.data, **span)
+        with _faults_of(self.name):
+            cl.enqueue_copy(self.queue, target.data, source.data, **span)
 
     def launch(
         self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
@@ -106,14 +178,15 @@ class OpenCL(Launches):
         local = LOCAL if count >= LOCAL * self.queue.device.max_compute_units else 1
         padded = -(-count // local) * local
         arguments = [_argument(a) for a in (*inputs, first, count, *outputs)]
-        with _launching:
+        with _launching, _faults_of(self.name):
             _kernel(self.queue.context, kernel)(self.queue, (padded,), (local,), *arguments)
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         """The driver has the threads. Wait for it: the memory of an input may be NumPy's."""
         if count:
             work(0, count)
-            self.queue.finish()
+            with _faults_of(self.name):
+                self.queue.finish()
 
 
 _launching = threading.Lock()  # a kernel object holds the arguments of one launch
@@ -129,8 +202,21 @@ def _kernel(context: Any, kernel: str) -> Any:
 @functools.cache
 def _program(context: Any, stem: str) -> Any:
     source = files("mmmgpu.kernels").joinpath(f"{stem}.cl").read_text()
-    program: Any = cl.Program(context, source)
-    return program.build(cache_dir=False)  # nor pyopencl's cache: it has stale locks
+    program: Any = cl.Program(context, INCLUDED.sub(_included, source))
+    try:
+        return program.build(cache_dir=False)  # nor pyopencl's cache: it has stale locks
+    except cl.RuntimeError as error:
+        lines = [line for line in str(error).splitlines() if "error" in line.lower()]
+        said = " ".join((lines or str(error).splitlines())[0].split())
+        raise DeviceError(
+            f"{context.devices[0].name}: its driver cannot build {stem}.cl ({said}); choose "
+            "another device with --backend: mmmgpu info lists those present"
+        ) from error
+
+
+def _included(line: re.Match[str]) -> str:
+    """The file that an include names: drivers take no folder with a blank in its name."""
+    return files("mmmgpu.kernels").joinpath(line[1]).read_text()
 
 
 def _argument(argument: Any) -> Any:

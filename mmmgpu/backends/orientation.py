@@ -5,13 +5,17 @@ and holes are filled. C_i never changes, so this is one sparse linear map for ea
 
     W_F(C_syn - C_i, C_i) = L_i C_syn - L_i C_i
 
-Most pixels are means of at most six pixels of C_syn. Those of more, and holes, have rows of their
-own; so have the cells of the pull-push pyramid that holes are interpolated from, which the rows of
-holes refer to like pixels. Not here: warping along the result, whose pattern is new in every frame.
+The pixels of a vector, 16 neighbours of a row, mostly come from neighbours in C_syn. So the map is
+kept in parts: for a vector and a distance, the shares that its pixels have in those so much further
+on. Holes have rows of their own; so have the cells of the pull-push pyramid that they are
+interpolated from, which the rows of holes refer to like pixels. Not here: warping along the result,
+whose pattern is new in every frame.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -19,32 +23,38 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from mmmgpu.arrays import F32, check_some_valid
+from mmmgpu.backends import default_threads
+from mmmgpu.backends.planes import LANES, pitch_of, planes
 from mmmgpu.backends.reference import landings
 
 I32 = NDArray[np.int32]
 Numbers = NDArray[np.int64]
 
-TAPS = 6  # of a pixel without a row of its own, as in kernels/prototypes
-OWN_ROW = -1  # first tap of a pixel with a row of its own
+NOWHERE = 2e8  # [px] fixed flow of what pads a row: it carries beyond any picture
 
 
 @dataclass(frozen=True)
 class Orientations:
-    """L_i of M prototypes of h x w pixels. A node is a pixel, or from h w on a cell.
+    """L_i of M prototypes of h x w pixels. Rows are padded to `pitch` pixels, whole vectors.
 
-    taps, shares: pixels of C_syn and their shares in each pixel, (M, h w, 6); the first tap is -1
-        where the pixel has a row of its own.
-    fixed: L_i C_i, (M, h w, 2) [px].
+    A node is a pixel, or from h pitch + 16 on a cell.
+
+    fixed: L_i C_i, (M, 2, h, pitch) [px].
+    firsts: first part of each vector, (M h pitch / 16 + 1,).
+    deltas: how many pixels further on a part lies, (parts,).
+    shares: of the vector's pixels in it, (parts, 16).
     rows: first row of each prototype, (M + 1,).
     targets: the node that each row gives, (R,).
     starts: first tap of each row, (R + 1,).
     row_taps, row_shares: nodes and their shares, (starts[R],).
-    nodes: of the prototype that has most.
+    nodes: places of a flow with 16 before it, 16 after it, and the cells of the prototype that has
+        most.
     """
 
-    taps: I32
-    shares: F32
     fixed: F32
+    firsts: I32
+    deltas: I32
+    shares: F32
     rows: I32
     targets: I32
     starts: I32
@@ -59,41 +69,59 @@ def orient(flows: F32, hole: float) -> Orientations:
     Raises:
         InputError: A flow leaves no pixel in the picture.
     """
-    number, h, w, _ = flows.shape
-    taps = np.empty((number, h * w, TAPS), np.int32)
-    shares = np.empty((number, h * w, TAPS), np.float32)
-    fixed = np.empty((number, h * w, 2), np.float32)
-    rows: list[Any] = []
-    targets: list[Numbers] = []
-    offsets, lengths = [], []
-    for i, flow in enumerate(flows):
-        pixels, valid = _splatted(flow, hole)
-        members, through = _filling(valid)
-        cells, holes = members @ pixels, np.flatnonzero(~valid)
-        many = np.flatnonzero(np.diff(pixels.indptr) > TAPS)
-        taps[i], shares[i] = _regular(pixels)
-        taps[i, many, 0] = taps[i, holes, 0] = OWN_ROW
-        own = flow.reshape(-1, 2).astype(np.float64)
-        carried = pixels @ own
-        carried[holes] = through @ (cells @ own)
-        fixed[i] = carried
-        through.indices += h * w
-        rows += [cells, pixels[many], through]
-        targets += [h * w + np.arange(cells.shape[0]), many, holes]
-        lengths.append(cells.shape[0] + len(many) + len(holes))
-        offsets.append(cells.shape[0])
-    counts = np.concatenate([np.diff(r.indptr) for r in rows])
+    _, h, w, _ = flows.shape
+    with ThreadPoolExecutor(default_threads()) as pool:
+        done = list(pool.map(_orient_one, flows, repeat(hole)))
+    fixed = planes(np.stack([o.fixed for o in done]))
+    fixed[..., w:] = NOWHERE
+    rows = [rows for o in done for rows in o.rows]
     return Orientations(
-        taps=taps,
-        shares=shares,
         fixed=fixed,
-        rows=_starts(lengths),
-        targets=np.concatenate(targets).astype(np.int32),
-        starts=_starts(counts),
+        firsts=_starts(np.concatenate([o.parts.counts for o in done])),
+        deltas=np.concatenate([o.parts.deltas for o in done]),
+        shares=np.concatenate([o.parts.shares for o in done]),
+        rows=_starts([len(o.targets) for o in done]),
+        targets=np.concatenate([o.targets for o in done]).astype(np.int32),
+        starts=_starts(np.concatenate([np.diff(r.indptr) for r in rows])),
         row_taps=np.concatenate([r.indices for r in rows]).astype(np.int32),
         row_shares=np.concatenate([r.data for r in rows]).astype(np.float32),
-        nodes=h * w + max(offsets),
+        nodes=h * pitch_of(w) + 2 * LANES + max(o.rows[0].shape[0] for o in done),
     )
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Of one prototype: parts of each vector (h pitch / 16,); deltas (n,); shares (n, 16)."""
+
+    counts: Numbers
+    deltas: I32
+    shares: F32
+
+
+@dataclass(frozen=True)
+class _Oriented:
+    """L_i: fixed (h, w, 2); parts; sparse rows of cells and of holes; which nodes these are."""
+
+    fixed: F32
+    parts: _Parts
+    rows: tuple[Any, Any]
+    targets: Numbers
+
+
+def _orient_one(flow: F32, hole: float) -> _Oriented:
+    h, w, _ = flow.shape
+    first_cell = h * pitch_of(w) + LANES
+    pixels, valid = _splatted(flow, hole)
+    members, through = _filling(valid)
+    cells, holes = members @ pixels, np.flatnonzero(~valid)
+    own = flow.reshape(-1, 2).astype(np.float64)
+    fixed = pixels @ own
+    fixed[holes] = through @ (cells @ own)
+    cells.indices = _padded(cells.indices, w)
+    through.indices += first_cell
+    targets = np.concatenate([first_cell + np.arange(cells.shape[0]), _padded(holes, w)])
+    carried = fixed.reshape(h, w, 2).astype(np.float32)
+    return _Oriented(carried, _parts(pixels, w), (cells, through), targets)
 
 
 def _starts(lengths: Sequence[int] | NDArray[Any]) -> I32:
@@ -118,11 +146,23 @@ def _splatted(flow: F32, hole: float) -> tuple[Any, NDArray[np.bool_]]:
     return pixels, valid.reshape(h, w)
 
 
-def _regular(pixels: Any) -> tuple[I32, F32]:
-    """The first `TAPS` taps of every pixel and their shares, (h w, 6); what is missing has none."""
-    there = np.arange(TAPS) < np.diff(pixels.indptr)[:, None]
-    at = np.where(there, pixels.indptr[:-1, None] + np.arange(TAPS), 0)
-    return pixels.indices[at], np.where(there, pixels.data[at], 0).astype(np.float32)
+def _parts(pixels: Any, width: int) -> _Parts:
+    """Shares of pixels in pixels, sparse (h w, h w), by vector and distance."""
+    area = pixels.shape[0] // width * pitch_of(width)
+    target = _padded(np.repeat(np.arange(pixels.shape[0]), np.diff(pixels.indptr)), width)
+    delta = _padded(pixels.indices, width) - target
+    vector, lane = np.divmod(target, LANES)
+    part, which = np.unique(vector * (2 * area) + delta + area, return_inverse=True)
+    shares = np.zeros((len(part), LANES), np.float32)
+    shares[which, lane] = pixels.data
+    counts = np.bincount(part // (2 * area), minlength=area // LANES)
+    return _Parts(counts, (part % (2 * area) - area).astype(np.int32), shares)
+
+
+def _padded(pixels: NDArray[Any], width: int) -> Numbers:
+    """Numbers of pixels in padded rows."""
+    y, x = np.divmod(pixels.astype(np.int64), width)
+    return y * pitch_of(width) + x
 
 
 def _filling(valid: NDArray[np.bool_]) -> tuple[Any, Any]:

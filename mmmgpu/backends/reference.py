@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, I32, check_some_valid
+from mmmgpu.backends.planes import picture, planes
 from mmmgpu.errors import InputError
 
 FAR = 1e8  # [px] beyond any picture, inside int32
@@ -85,26 +86,20 @@ class Reference:
     def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
         return Prototypes(images, flows, hole)
 
-    def move_prototypes(
-        self, held: Prototypes, flow: F32, used: I32, places: I32, scale: F32, asked: int
-    ) -> F32:
-        moved = np.empty((len(used), asked, 3), np.float32)
-        shown = np.flatnonzero(places >= 0)
+    def move_prototypes(self, held: Prototypes, flow: F32, used: I32, scale: F32) -> F32:
+        to = picture(flow[0], held.images.shape[2])[None]
+        moved = np.empty((len(used), *held.images.shape[1:]), np.float32)
         for j, i in enumerate(used):
             own = held.flows[i : i + 1]
-            oriented = self._filled_warp(flow[None] - own, own, held.hole)
-            seen = self._filled_warp(held.images[i : i + 1], oriented, held.hole)
-            scaled = seen[0] * scale[..., None]
-            moved[j, places.ravel()[shown]] = scaled.reshape(-1, 3)[shown]
-        return moved
+            oriented = self._filled_warp(to - own, own, held.hole)
+            moved[j] = self._filled_warp(held.images[i : i + 1], oriented, held.hole)[0]
+        return np.asarray(planes(moved) * scale, np.float32)
 
-    def mix_prototypes(
-        self, held: Prototypes, flows: F32, weights: F32, places: I32, scale: F32, asked: int
-    ) -> F32:
-        mixed = np.zeros((len(flows), asked, 3), np.float32)
+    def mix_prototypes(self, held: Prototypes, flows: F32, weights: F32, scale: F32) -> F32:
+        mixed = np.zeros((len(flows), 3, *scale.shape), np.float32)
         for b, (flow, share) in enumerate(zip(flows, weights, strict=True)):
             used = np.flatnonzero(share).astype(np.int32)
-            moved = self.move_prototypes(held, flow, used, places, scale, asked)
+            moved = self.move_prototypes(held, flow[None], used, scale)
             mixed[b] = np.tensordot(share[used].astype(np.float64), moved, axes=1)
         return mixed
 

@@ -1,0 +1,164 @@
+"""Matching scans, trajectories, and the gradients of adaptation and training."""
+
+from functools import partial
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, solveh_banded
+
+from mmmgpu.bench.cases import smooth_flow
+from mmmgpu.bench.drawn import drawn_basis
+from mmmgpu.bench.timing import Contender, Work
+from mmmgpu.correspondence import rbf_correspondence
+from mmmgpu.gdlr import error_and_slope, extended, identity_regressions, regressed
+from mmmgpu.matching import View, flow_distances
+from mmmgpu.phonemes import PhonemeModels, segment_durations
+from mmmgpu.trajectories import (
+    error_and_gradient,
+    factor_system,
+    follow,
+    lay_out,
+    synthesize_trajectory,
+)
+
+DIMENSIONS, PHONES, CLASSES, ORDER, LAMBDA = 50, 40, 6, 4, 1.0
+SIMPLE = 1e-8  # of the scale of what is solved for
+
+
+def model_works(backends, peers):
+    """Makers of the `Work` of each, by name."""
+    return {
+        "matching": partial(matching_work, backends),
+        "trajectory": partial(trajectory_work, peers),
+        "gdlr": gdlr_work,
+        "training": training_work,
+    }
+
+
+def matching_work(backends, prototypes=46, frames=450, side=128):
+    """Eq. 7: the flows of all frames read along S and compared with those of all prototypes."""
+    rng = np.random.default_rng(0)
+    basis = drawn_basis(prototypes + 1, side)  # the first does not move
+    marks = rng.uniform(0.1, 0.9, (12, 2)) * side
+    map_ = rbf_correspondence(marks, 1.02 * marks + rng.normal(0, 0.5, marks.shape))
+    flows = smooth_flow(rng, frames, side, side)
+
+    def scan(name, some):
+        views = [View(0, map_, basis.flows[1:][:some], flows)]
+        return flow_distances(basis, views, np.zeros(some, np.int64), backend=name)
+
+    pixels = int((basis.w_f > 0.02).sum())
+    return Work(
+        f"matching scan, {prototypes} prototypes, {frames} frames of {side}x{side}",
+        lambda: scan("numpy", 1),
+        {n: Contender(lambda n=n: lambda: scan(n, prototypes), tolerance=1e-5) for n in backends},
+        bytes=frames * pixels * 2 * 4 * 3,
+        operations=prototypes * frames * pixels * 8 + frames * pixels * 22,
+        items=frames,
+        unit="frame",
+        part=1 / prototypes,
+    )
+
+
+def speech(frames, seed=0):
+    """Models of `PHONES` phones, and the phone of each of `frames` frames."""
+    rng = np.random.default_rng(seed)
+    names = tuple(f"phone {i:02}" for i in range(PHONES))
+    shape = PHONES, DIMENSIONS
+    models = PhonemeModels(
+        names, rng.normal(size=shape), rng.uniform(0.3, 3, shape), np.full(PHONES, 100)
+    )
+    rows = np.repeat(rng.integers(PHONES, size=frames), rng.integers(2, 8, size=frames))[:frames]
+    return models, rows
+
+
+def trajectory_work(peers, seconds=3, fps=25):
+    """Eq. 3 for a sentence in all dimensions; the reference solves one dense system a dimension."""
+    models, rows = speech(seconds * fps)
+    labels = [models.labels[row] for row in rows]
+    line = lay_out([rows], [segment_durations(labels, None)], order=ORDER)
+    n = len(rows)
+
+    def dense():
+        W = np.diff(np.eye(n), ORDER, axis=0)
+        columns = []
+        for mean, variance in zip(models.mean.T, models.variance.T, strict=True):
+            q = line.weight / variance[rows]
+            columns.append(np.linalg.solve(np.diag(q) + LAMBDA * W.T @ W, q * mean[rows]))
+        return np.stack(columns, 1)
+
+    def banded():
+        columns = []
+        for mean, variance in zip(models.mean.T, models.variance.T, strict=True):
+            q = line.weight / variance[rows]
+            band = LAMBDA * line.band.T
+            band[0] += q
+            columns.append(solveh_banded(band, q * mean[rows], lower=True))
+        return np.stack(columns, 1)
+
+    def ours():
+        return synthesize_trajectory(models, labels, smoothness=LAMBDA, order=ORDER)
+
+    peer = {"scipy solveh_banded": Contender(lambda: banded)} if "scipy" in peers else {}
+    contenders = {"ours": Contender(lambda: ours, tolerance=SIMPLE), **peer}
+    name = f"trajectory of {seconds} s, {DIMENSIONS} dimensions"
+    return Work(name, dense, contenders, items=n, unit="frame")
+
+
+def gdlr_work(seconds=15, fps=25):
+    """dE/dR of Eq. 17 by the adjoint; the reference solves Eq. 16 for each entry of R in turn.
+
+    It uses the factor of A that is there already, and that an entry moves one dimension only.
+    """
+    models, rows = speech(seconds * fps)
+    line = lay_out([rows], [segment_durations([*rows], None)], order=ORDER)
+    system = factor_system(line, models, np.full(DIMENSIONS, LAMBDA))
+    classes = np.arange(PHONES) % CLASSES
+    z = np.random.default_rng(1).normal(size=(len(rows), DIMENSIONS))
+    R = identity_regressions(CLASSES, DIMENSIONS)
+
+    def adjoint():
+        return error_and_slope(system, R, models.mean, z, classes)[1]
+
+    def one_by_one():
+        residual = 2 * (system.follow(regressed(R, models.mean, classes)) - z)
+        xi, slope, n = extended(models.mean)[rows], np.zeros_like(R), len(rows)
+        for g, i, j in np.ndindex(R.shape):
+            pull = line.weight * system.precision[rows, i] * xi[:, j] * (classes[rows] == g)
+            factor = system.factor[:, i * n : (i + 1) * n]
+            dy = cho_solve_banded((factor, True), pull, check_finite=False)
+            slope[g, i, j] = residual[:, i] @ dy
+        return slope
+
+    name = f"GDLR gradient, {CLASSES} classes, {DIMENSIONS} dimensions, {seconds} s"
+    return Work(name, one_by_one, {"adjoint": Contender(lambda: adjoint, tolerance=SIMPLE)})
+
+
+def training_work(seconds=120, fps=25, dimensions=4):
+    """The gradient of Eq. 4 by the adjoint; the reference has a solve for each mu and sigma."""
+    models, rows = speech(seconds * fps)
+    line = lay_out([rows], [segment_durations([*rows], None)], order=ORDER)
+    z = np.random.default_rng(1).normal(size=(len(rows), dimensions))
+
+    def adjoint():
+        pairs = [
+            error_and_gradient(line, z[:, j], models.mean[:, j], models.variance[:, j], LAMBDA)[1:]
+            for j in range(dimensions)
+        ]
+        return tuple(np.stack(part) for part in zip(*pairs, strict=True))
+
+    def one_by_one():
+        by_mean, by_log_variance = np.zeros((2, dimensions, PHONES))
+        for j in range(dimensions):
+            mean, variance = models.mean[:, j], models.variance[:, j]
+            y, factor = follow(line, mean, variance, LAMBDA)
+            q, off = line.weight / variance[rows], mean[rows] - y
+            for p in range(PHONES):
+                pull = q * (rows == p)
+                dy = cho_solve_banded((factor, True), pull, check_finite=False)
+                by_mean[j, p] = 2 * (y - z[:, j]) @ dy
+                dy = cho_solve_banded((factor, True), -pull * off, check_finite=False)
+                by_log_variance[j, p] = 2 * (y - z[:, j]) @ dy
+        return by_mean, by_log_variance
+
+    name = f"training gradient, {PHONES} phones, {dimensions} dimensions, {seconds} s"
+    return Work(name, one_by_one, {"adjoint": Contender(lambda: adjoint, tolerance=SIMPLE)})

@@ -1,0 +1,146 @@
+"""Whole synthesis and analysis of frames, as `speak` and `train` do them."""
+
+from functools import partial
+
+import cv2
+import numpy as np
+
+from mmmgpu.analysis import analyze, prepare_analysis
+from mmmgpu.backends import default_threads, get_backend
+from mmmgpu.basis import MOUTH
+from mmmgpu.bench.drawn import drawn_basis, drawn_coordinates, drawn_mouths
+from mmmgpu.bench.timing import Contender, Work
+from mmmgpu.parallel import map_ordered, one_thread_each
+from mmmgpu.synthesis import mouths, prepare_synthesis
+
+PROTOTYPES, SIDE, FRAMES = 46, 256, 8
+EQUAL = 1e-4  # of pictures in [0, 1]
+ALIKE = 0.03  # of the scale of model coordinates: flows are found anew in slightly other pictures
+NO_FLOW = 1e-4  # [px] at which an inverse flow is done
+STEPS = 20
+
+
+def picture_works(backends, peers):
+    """Makers of the `Work` of synthesis and analysis, by name."""
+    return {
+        "synthesis": partial(synthesis_work, backends, peers),
+        "mouths": partial(mouths_work, backends),
+        "analysis": partial(analysis_work, backends),
+    }
+
+
+def synthesis_work(backends, peers, prototypes=PROTOTYPES, side=SIDE, frames=FRAMES):
+    """Frames with every prototype in them, the whole region."""
+    basis = drawn_basis(prototypes, side)
+    coordinates = drawn_coordinates(prototypes, frames)
+    contenders = {name: synthesis(basis, coordinates, name) for name in backends}
+    whole = np.ones((side, side), bool)
+    if "opencv" in peers:
+        contenders["opencv + numpy"] = Contender(lambda: remapped(basis, *coordinates))
+    name = f"synthesis, {prototypes} prototypes of {side}x{side}"
+    return frames_of(name, basis, coordinates, whole, contenders)
+
+
+def mouths_work(backends, prototypes=PROTOTYPES, side=SIDE, frames=FRAMES):
+    """The same where only the mouth will be looked at."""
+    basis = drawn_basis(prototypes, side)
+    coordinates, shown = drawn_coordinates(prototypes, frames), basis.w_t > 0
+    contenders = {name: synthesis(basis, coordinates, name, shown) for name in backends}
+    name = f"the same, the mouth's {int(shown.sum())} pixels"
+    return frames_of(name, basis, coordinates, shown, contenders)
+
+
+def frames_of(name, basis, coordinates, shown, contenders):
+    """The work of synthesis where pictures are shown: each prototype read and carried once."""
+    first, frames = tuple(c[:1] for c in coordinates), len(coordinates[0])
+    pixels = len(basis.images) * int(shown.sum())
+    return Work(
+        name,
+        synthesis(basis, first, "numpy", shown).load(),
+        contenders,
+        bytes=frames * (pixels * 5 * 4 + int(shown.sum()) * 3 * 4),
+        operations=frames * pixels * (2 * 6 * 2 + 8 * 4 + 2 * 3 + 8),
+        items=frames,
+        unit="frame",
+        part=1 / frames,
+    )
+
+
+def synthesis(basis, coordinates, name, shown=None):
+    """Synthesis by one of our backends, prepared once; pictures in host memory."""
+
+    def load():
+        synthesizer = prepare_synthesis(basis, shown=shown, backend=name)
+        return lambda: np.stack(list(mouths(synthesizer, *coordinates)))
+
+    return Contender(load, tolerance=EQUAL)
+
+
+def remapped(basis, alpha, beta):
+    """What OpenCV offers: backward warps along inverse flows, which is nearly the same picture.
+
+    The flow of each prototype is inverted once. A frame then takes two `remap` a prototype: one
+    carries the residual flow to the prototype, the other reads the prototype against it.
+    """
+    h, w = basis.images.shape[1:3]
+    x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
+    grid = np.stack([x, y], -1)
+    back = [inverse(flow, grid) for flow in basis.flows]
+
+    def one(a, b):
+        flow, total = basis.flow(a), np.zeros((h, w, 3), np.float32)
+        for i, image in enumerate(basis.images):
+            moved = _read(flow - basis.flows[i], grid + back[i])
+            cv2.scaleAdd(_read(image, grid - moved), float(b[i]), total, total)
+        return np.clip(total, 0, 1)
+
+    return lambda: np.stack([one(a, b) for a, b in zip(alpha, beta, strict=True)])
+
+
+def inverse(flow, grid):
+    """q with q(p + flow(p)) = -flow(p), by fixed-point iteration."""
+    back = -flow
+    for _ in range(STEPS):
+        back = -_read(flow, grid + back)
+    return back
+
+
+def _read(field, places):
+    options = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
+    return cv2.remap(field, places, None, **options)
+
+
+def analysis_work(backends, prototypes=PROTOTYPES, side=SIDE, frames=FRAMES):
+    """Mouths that are no prototypes, several at a time on one thread each."""
+    basis = drawn_basis(prototypes, side)
+    mouths = drawn_mouths(prototypes + frames, side)
+    known = {image.tobytes() for image in basis.images}
+    images = [image for image in mouths if image.tobytes() not in known][:frames]
+    return Work(
+        f"analysis, {prototypes} prototypes of {side}x{side}",
+        analysis(basis, images[:1], "numpy").load(),
+        {name: analysis(basis, images, name) for name in backends},
+        bytes=frames * int((basis.w_t > MOUTH).sum()) * prototypes * 5 * 4,
+        items=frames,
+        unit="frame",
+        part=1 / frames,
+    )
+
+
+def analysis(basis, images, name):
+    """Analysis by one of our backends, as rows of alpha and beta."""
+
+    def load():
+        analyzer = prepare_analysis(basis, get_backend(name, 1))
+
+        def one(image, _):
+            return analyze(analyzer, image)
+
+        def run():
+            with one_thread_each():
+                found = list(map_ordered(one, images, threads=default_threads()))
+            return tuple(np.stack(part) for part in zip(*found, strict=True))
+
+        return run
+
+    return Contender(load, tolerance=ALIKE)

@@ -1,0 +1,126 @@
+"""What the kernels are meant to reach, as ratios within one run, and whether they do.
+
+Each is judged by the best backend, with the medians of the run.
+"""
+
+from dataclasses import dataclass
+
+from mmmgpu.bench.timing import REFERENCE
+
+BACKENDS = ("warp", "opencl")
+
+
+@dataclass(frozen=True)
+class Target:
+    """At least (or at most) `bound` of what `value` finds in the results; None: not measured."""
+
+    name: str
+    bound: float
+    value: object
+    most: bool = False
+
+
+def median(results, key, *who):
+    """The least median [ms] of some contenders of a work; None where none of them was measured."""
+    rows = results["works"].get(key, {}).get("contenders", {})
+    return min((rows[w]["median_ms"] for w in rows if family(w) in who), default=None)
+
+
+def family(contender):
+    """The backend without its device."""
+    return contender.partition(":")[0]
+
+
+def faster_than(key, peer):
+    """How many times faster than a peer the best of ours is."""
+
+    def value(results):
+        theirs, ours = median(results, key, peer), median(results, key, *BACKENDS, "adjoint")
+        return theirs / ours if theirs and ours else None
+
+    return value
+
+
+def per_second(key):
+    """Items a second of the best of ours."""
+
+    def value(results):
+        ours = median(results, key, *BACKENDS)
+        return 1e3 * results["works"][key]["items"] / ours if ours else None
+
+    return value
+
+
+def of_one_pass(key):
+    """The time of the best of ours in those of a pass over the bytes at copy bandwidth."""
+
+    def value(results):
+        ours = median(results, key, *BACKENDS)
+        if not ours:
+            return None
+        once = results["works"][key]["bytes"] / results["machine"]["copy_gb_per_s"] / 1e6
+        return ours / once
+
+    return value
+
+
+def apart(results):
+    """The largest ratio between the two backends over all works."""
+    pairs = [[median(results, key, name) for name in BACKENDS] for key in results["works"]]
+    ratios = [max(pair) / min(pair) for pair in pairs if all(pair)]
+    return max(ratios, default=None)
+
+
+def steepest(results):
+    """The largest exponent of growth in pixels, frames and corpus length."""
+    axes = (results.get("growth", {}).get(axis, {}) for axis in ("pixels", "frames", "corpus rows"))
+    return max((found["exponent"] for axis in axes for found in axis.values()), default=None)
+
+
+def gain(key):
+    """What all threads gain over one, the best backend."""
+
+    def value(results):
+        gains = results.get("threads", {}).get("gain", {})
+        return max((gains[k] for b in BACKENDS if (k := f"{key}, {b}") in gains), default=None)
+
+    return value
+
+
+def slowest_start(results):
+    """Seconds to the first frame with a full cache, of the slower backend."""
+    return max((s["full_cache_s"] for s in results.get("startup", {}).values()), default=None)
+
+
+TARGETS = (
+    Target("forward_warp over numba", 1.5, faster_than("splat", "numba")),
+    Target("distance_scan over numba", 1.5, faster_than("scan", "numba")),
+    Target("sample over OpenCV remap", 0.8, faster_than("sample", "opencv")),
+    Target("blend, passes over its bytes", 1.3, of_one_pass("blend"), most=True),
+    Target("dense RBF over NumPy", 3, faster_than("rbf", "numpy peer")),
+    Target("synthesis [frames/s]", 60, per_second("synthesis")),
+    Target("synthesis over the reference", 20, faster_than("synthesis", REFERENCE)),
+    Target("synthesis over OpenCV + NumPy", 3, faster_than("synthesis", "opencv + numpy")),
+    Target("mouths [frames/s]", 100, per_second("mouths")),
+    Target("analysis [frames/s]", 20, per_second("analysis")),
+    Target("GDLR over Eq. 16", 50, faster_than("gdlr", REFERENCE)),
+    Target("training over a solve a parameter", 50, faster_than("training", REFERENCE)),
+    Target("backends apart by at most", 2, apart, most=True),
+    Target("steepest growth, exponent", 1.1, steepest, most=True),
+    Target("threads, forward_warp", 1.7, gain("splat")),
+    Target("threads, distance_scan", 1.7, gain("scan")),
+    Target("threads, dense RBF", 1.7, gain("rbf")),
+    Target("first frame, full cache [s]", 1, slowest_start, most=True),
+)
+
+
+def judge_targets(results):
+    """For every target that was measured: bound, value and whether it is met."""
+    found = {}
+    for target in TARGETS:
+        value = target.value(results)
+        if value is not None:
+            met = value <= target.bound if target.most else value >= target.bound
+            bound = f"{'<=' if target.most else '>='} {target.bound:g}"
+            found[target.name] = {"bound": bound, "value": round(value, 2), "met": bool(met)}
+    return found

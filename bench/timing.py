@@ -1,0 +1,164 @@
+"""Honest times: every answer is compared with the reference, then all contenders take turns.
+
+A busy machine is then busy for all of them. Compiling and fetching kernels (the first run),
+transfer and compute are apart. What is reported is the median, with quartiles and the best.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mmmgpu.errors import InputError
+
+REFERENCE = "reference"
+PAUSE = 0.03  # s
+SLOW = 1.0  # s: what takes longer has one turn only
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Who does a piece of work.
+
+    load: brings what is needed to where it is worked on, and returns what is timed.
+    fetch: brings an answer back: NumPy arrays, as the reference gives them.
+    tolerance: the largest difference from the reference, as a share of its scale; None for a peer,
+        whose difference is shown.
+    """
+
+    load: Callable[[], Callable[[], Any]]
+    fetch: Callable[[Any], Any] = lambda answer: answer
+    tolerance: float | None = None
+
+
+@dataclass(frozen=True)
+class Work:
+    """A piece of work and who does it.
+
+    reference: computes the answer slowly, or the first part of it.
+    contenders: by name.
+    bytes, operations: that it takes at least, for the roofline; None where they are not counted.
+    items: how many things are done in one run, of the kind `unit`.
+    part: the share of the work that the reference does.
+    """
+
+    name: str
+    reference: Callable[[], Any]
+    contenders: Mapping[str, Contender]
+    bytes: float | None = None
+    operations: float | None = None
+    items: int = 1
+    unit: str = "run"
+    part: float = 1.0
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long to measure: at least `turns` of all contenders, then until `seconds` are over."""
+
+    turns: int = 5
+    seconds: float = 2.0
+    most: int = 25
+
+
+QUICK = Effort(turns=3, seconds=0.3)
+
+
+def measure(work, effort):
+    """What is known of a piece of work after `effort`, as JSON values.
+
+    Raises:
+        InputError: An answer differs from the reference by more than its tolerance.
+    """
+    start = time.perf_counter(), time.process_time()
+    desired = as_tuple(work.reference())
+    slow = (time.perf_counter() - start[0]) / work.part
+    processor = (time.process_time() - start[1]) / work.part
+    runs, found = {}, {}
+    for name, contender in work.contenders.items():
+        runs[name], found[name] = validated(work.name, name, contender, desired)
+    seconds = take_turns(runs, effort)
+    rows = {name: statistics(*s) | found[name] for name, s in seconds.items()}
+    rows[REFERENCE] = statistics(np.array([slow]), np.array([processor]))
+    size = {"bytes": work.bytes, "operations": work.operations}
+    return {"items": work.items, "unit": work.unit, **size, "contenders": rows}
+
+
+def validated(work, name, contender, desired):
+    """The function to time, and how its first answer came about."""
+    start = time.perf_counter()
+    run = contender.load()
+    loaded = time.perf_counter()
+    answer = run()
+    done = time.perf_counter()
+    actual = as_tuple(contender.fetch(answer))
+    fetched = time.perf_counter()
+    error = difference(actual, desired)
+    if contender.tolerance is not None and not error <= contender.tolerance:
+        raise InputError(
+            f"{work}, {name}: differs from the reference by {error:.1e} of its scale, more than "
+            f"{contender.tolerance:.0e}: not timed; run the tests of this backend"
+        )
+    return run, {
+        "first_ms": milliseconds(done - loaded),
+        "transfer_ms": milliseconds(loaded - start + fetched - done),
+        "difference": float(f"{error:.2g}"),
+    }
+
+
+def as_tuple(answer):
+    """One array or several as a tuple."""
+    return answer if isinstance(answer, tuple) else (answer,)
+
+
+def difference(actual, desired):
+    """The largest difference of any output, as a share of that output's scale.
+
+    Of an output that is longer than the reference's, the first part is compared.
+    """
+    pairs = ((a[: len(d)], d) for a, d in zip(actual, desired, strict=True))
+    return max(float(np.abs(a - d).max() / (np.abs(d).max() or 1)) for a, d in pairs)
+
+
+def take_turns(runs, effort):
+    """Seconds of every run of each of `runs`, and of the processor for it; after one to warm up."""
+    warm = {name: timed(run) for name, run in runs.items()}
+    seconds = {name: [once] if once[0] > SLOW else [] for name, once in warm.items()}
+    quick = [name for name in runs if not seconds[name]]
+    begin = time.perf_counter()
+    for turn in range(effort.most):
+        if turn >= effort.turns and time.perf_counter() - begin > effort.seconds:
+            break
+        for name in quick:
+            seconds[name].append(timed(runs[name]))
+    return {name: np.array(s).T for name, s in seconds.items()}
+
+
+def timed(run):
+    """Seconds of one run, and of the processor for it, all threads.
+
+    After a pause, for the threads of the library before may still spin.
+    """
+    time.sleep(PAUSE)
+    start, processor = time.perf_counter(), time.process_time()
+    run()
+    return time.perf_counter() - start, time.process_time() - processor
+
+
+def statistics(seconds, processor):
+    """Median, quartiles and best [ms]; the least of the processor, which other work slows least."""
+    low, median, high = np.percentile(seconds, [25, 50, 75])
+    return {
+        "median_ms": milliseconds(median),
+        "quartiles_ms": [milliseconds(low), milliseconds(high)],
+        "best_ms": milliseconds(seconds.min()),
+        "cpu_ms": milliseconds(processor.min()),
+        "turns": len(seconds),
+    }
+
+
+def milliseconds(seconds):
+    """Four digits of them."""
+    return float(f"{1e3 * seconds:.4g}")

@@ -1,0 +1,110 @@
+"""Vectors of 16 neighbours in a row of a plane, and what kernels do with them lane by lane.
+
+A plane is one channel of a picture in rows padded to whole vectors; a padded row is a pitch. Loops
+over lanes become vectors where their bounds are literal and nothing in them minds NaN.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+FAR = wp.constant(1.0e8)  # [px] beyond any picture, inside int32
+HUGE = wp.constant(1.0e30)
+LANES = 16
+LAST = 15  # lane
+HALF = 8  # lanes
+vec16 = wp.types.vector(length=LANES, dtype=float)
+ivec16 = wp.types.vector(length=LANES, dtype=int)
+uvec16 = wp.types.vector(length=LANES, dtype=wp.uint16)
+
+
+@wp.func
+def get(values: wp.array[float], i: int):
+    """The vector of values i ... i + 15."""
+    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec16)
+    return here[0]
+
+
+@wp.func
+def put(values: wp.array[float], i: int, v: vec16):
+    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec16)
+    here[0] = v
+
+
+@wp.func
+def pitch_of(width: int):
+    return (width + LANES - 1) / LANES * LANES
+
+
+@wp.func
+def colours(texture: uvec16):
+    v = vec16()
+    for j in range(LANES):
+        v[j] = float(texture[j])
+    return v
+
+
+@wp.func
+def within_reach(q: float):
+    return wp.where(q < -FAR, -FAR, wp.where(q > FAR, FAR, q))
+
+
+@wp.func
+def whole(q: vec16):
+    """floor(q)."""
+    n = ivec16()
+    for j in range(LANES):
+        n[j] = int(wp.floor(within_reach(q[j])))
+    return n
+
+
+@wp.func
+def fraction(q: vec16, n: ivec16):
+    f = vec16()
+    for j in range(LANES):
+        f[j] = within_reach(q[j]) - float(n[j])
+    return f
+
+
+@wp.func
+def inside(share: vec16, place: ivec16, size: int):
+    """The shares of what arrives within a side of the picture, else 0."""
+    v = vec16()
+    for j in range(LANES):
+        v[j] = wp.where(wp.uint32(place[j]) < wp.uint32(size), share[j], 0.0)
+    return v
+
+
+@wp.func
+def least(n: ivec16):
+    first = n[0]
+    for j in range(1, LANES):
+        first = wp.min(first, n[j])
+    return first
+
+
+@wp.func
+def one_later(v: vec16):
+    later = vec16()
+    for j in range(LAST):
+        later[j + 1] = v[j]
+    return later
+
+
+@wp.func
+def share_of(n: vec16, least: float):
+    """One over the weight where it is enough, else 0."""
+    share = vec16()
+    for j in range(LANES):
+        share[j] = wp.where(n[j] >= least, 1.0 / n[j], 0.0)
+    return share
+
+
+@wp.func
+def pairs(left: vec16, right: vec16):
+    """Sums of neighbours."""
+    v = vec16()
+    for j in range(HALF):
+        v[j] = left[2 * j] + left[2 * j + 1]
+        v[j + HALF] = right[2 * j] + right[2 * j + 1]
+    return v

@@ -1,0 +1,125 @@
+/* Pull-push hole filling of planes: red, green, blue and weight, one after the other.
+ *
+ * The finest level holds means with a weight of 1, and nothing in holes; coarser ones hold sums. A
+ * cell without weight is interpolated from the next coarser level.
+ */
+
+/* The level after one of h x w: sums over blocks of 2 x 2. Returns the least weight of all. */
+float pull(__global const float *fine, const int step, const int h, const int w,
+           __global float *cells)
+{
+    const int pitch = pitch_of(w);
+    const int columns = (w + 1) / 2;
+    const int across = pitch_of(columns);
+    const int rows = (h + 1) / 2;
+    float16 low = (float16)HUGE;
+    for (int y = 0; y < rows; ++y)
+        for (int x = 0; x < across; x += LANES) {
+            float16 sum = (float16)0.0f;
+            for (int c = 0; c < 4; ++c) {
+                __global const float *from = fine + c * step + 2 * y * pitch + 2 * x;
+                float16 left = get(from);
+                float16 right = (float16)0.0f;
+                if (2 * y + 1 < h)
+                    left += get(from + pitch);
+                if (2 * x + LANES < pitch) {
+                    right = get(from + LANES);
+                    if (2 * y + 1 < h)
+                        right += get(from + pitch + LANES);
+                }
+                sum = pairs(left, right);
+                put(cells + (c * rows + y) * across + x, sum);
+            }
+            low = (x + LANE < columns & sum < low) ? sum : low;
+        }
+    return least_value(low);
+}
+
+float4 mean(__global const float *cells, const int i, const int step)
+{
+    const float share = 1.0f / cells[i + 3 * step];
+    return share * (float4)(cells[i], cells[i + step], cells[i + 2 * step], 0.0f);
+}
+
+/* The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete. */
+float4 between(__global const float *coarse, const int h, const int w, const int y, const int x)
+{
+    const int columns = (w + 1) / 2;
+    const int rows = (h + 1) / 2;
+    const int across = pitch_of(columns);
+    const int step = rows * across;
+    const int x0 = x / 2;
+    const int side = x0 + 2 * (x % 2) - 1;
+    const int x1 = side < 0 ? 0 : side < columns ? side : columns - 1;
+    const int y0 = y / 2 * across;
+    const int above = y / 2 + 2 * (y % 2) - 1;
+    const int y1 = (above < 0 ? 0 : above < rows ? above : rows - 1) * across;
+    const float4 near = 0.75f * mean(coarse, y0 + x0, step) + 0.25f * mean(coarse, y0 + x1, step);
+    const float4 far = 0.75f * mean(coarse, y1 + x0, step) + 0.25f * mean(coarse, y1 + x1, step);
+    return 0.75f * near + 0.25f * far;
+}
+
+/* Give an empty cell a colour, and the weight of one pixel. */
+void set_cell(__global float *cells, const int i, const int step, const float4 colour)
+{
+    cells[i] = colour.x;
+    cells[i + step] = colour.y;
+    cells[i + 2 * step] = colour.z;
+    cells[i + 3 * step] = 1.0f;
+}
+
+/* Push: fill the empty cells of some levels, of which the last has none. */
+void complete(__global float *cells, const int height, const int width, const int levels)
+{
+    for (int up = 1; up < levels; ++up) {
+        int h = height;
+        int w = width;
+        __global float *at = cells;
+        for (int level = 0; level < levels - 1 - up; ++level) {
+            at += 4 * h * pitch_of(w);
+            h = (h + 1) / 2;
+            w = (w + 1) / 2;
+        }
+        const int pitch = pitch_of(w);
+        const int step = h * pitch;
+        for (int y = 0; y < h; ++y)
+            for (int x = 0; x < w; ++x) {
+                const int i = y * pitch + x;
+                if (at[i + 3 * step] == 0.0f)
+                    set_cell(at, i, step, between(at + 4 * step, h, w, y, x));
+            }
+    }
+}
+
+/* Pull-push of means with holes, as far as they are asked for. Returns 0 of nothing but holes.
+ *
+ * Levels are made until one has no empty cell.
+ */
+int fill(__global float *total, const int step, const int height, const int width,
+         __global const float *scale, __global float *cells)
+{
+    int h = (height + 1) / 2;
+    int w = (width + 1) / 2;
+    float low = pull(total, step, height, width, cells);
+    __global float *at = cells;
+    int levels = 1;
+    while (low == 0.0f && (h > 1 || w > 1)) {
+        const int plane = h * pitch_of(w);
+        low = pull(at, plane, h, w, at + 4 * plane);
+        at += 4 * plane;
+        h = (h + 1) / 2;
+        w = (w + 1) / 2;
+        ++levels;
+    }
+    if (low == 0.0f)
+        return 0;
+    complete(cells, (height + 1) / 2, (width + 1) / 2, levels);
+    const int pitch = pitch_of(width);
+    for (int y = 0; y < height; ++y)
+        for (int x = 0; x < width; ++x) {
+            const int i = y * pitch + x;
+            if (total[3 * step + i] == 0.0f && scale[i] > 0.0f)
+                set_cell(total, i, step, between(cells, height, width, y, x));
+        }
+    return 1;
+}

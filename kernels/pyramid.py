@@ -1,0 +1,131 @@
+"""Pull-push hole filling of planes: red, green, blue and weight, one after the other.
+
+The finest level holds means with a weight of 1, and nothing in holes; coarser ones hold sums. A
+cell without weight is interpolated from the next coarser level.
+"""
+
+import warp as wp
+
+from mmmgpu.kernels.lanes import HUGE, LANES, get, pairs, pitch_of, put, vec16
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def pull(
+    fine: wp.array[float], finest: int, step: int, h: int, w: int, cells: wp.array[float], to: int
+):
+    """The level after one of h x w: sums over blocks of 2 x 2. Returns the least weight of all."""
+    pitch = pitch_of(w)
+    columns = (w + 1) / 2
+    across = pitch_of(columns)
+    rows = (h + 1) / 2
+    low = vec16(HUGE)
+    for y in range(rows):
+        for x in range(0, across, LANES):
+            sum = vec16()
+            for c in range(4):
+                i = finest + c * step + 2 * y * pitch + 2 * x
+                left = get(fine, i)
+                right = vec16()
+                if 2 * y + 1 < h:
+                    left += get(fine, i + pitch)
+                if 2 * x + LANES < pitch:
+                    right = get(fine, i + LANES)
+                    if 2 * y + 1 < h:
+                        right += get(fine, i + pitch + LANES)
+                sum = pairs(left, right)
+                put(cells, to + (c * rows + y) * across + x, sum)
+            for j in range(LANES):
+                low[j] = wp.where(x + j < columns and sum[j] < low[j], sum[j], low[j])
+    return wp.min(low)
+
+
+@wp.func
+def mean(cells: wp.array[float], i: int, step: int):
+    share = 1.0 / cells[i + 3 * step]
+    return wp.vec3(share * cells[i], share * cells[i + step], share * cells[i + 2 * step])
+
+
+@wp.func
+def between(cells: wp.array[float], coarse: int, h: int, w: int, y: int, x: int):
+    """The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete."""
+    columns = (w + 1) / 2
+    rows = (h + 1) / 2
+    across = pitch_of(columns)
+    step = rows * across
+    x0 = x / 2
+    x1 = wp.clamp(x0 + 2 * (x % 2) - 1, 0, columns - 1)
+    y0 = coarse + y / 2 * across
+    y1 = coarse + wp.clamp(y / 2 + 2 * (y % 2) - 1, 0, rows - 1) * across
+    near = 0.75 * mean(cells, y0 + x0, step) + 0.25 * mean(cells, y0 + x1, step)
+    far = 0.75 * mean(cells, y1 + x0, step) + 0.25 * mean(cells, y1 + x1, step)
+    return 0.75 * near + 0.25 * far
+
+
+@wp.func
+def set_cell(cells: wp.array[float], i: int, step: int, colour: wp.vec3):
+    """Give an empty cell a colour, and the weight of one pixel."""
+    cells[i] = colour[0]
+    cells[i + step] = colour[1]
+    cells[i + 2 * step] = colour[2]
+    cells[i + 3 * step] = 1.0
+
+
+@wp.func
+def complete(cells: wp.array[float], first: int, height: int, width: int, levels: int):
+    """Push: fill the empty cells of `levels` levels, of which the last has none."""
+    for up in range(1, levels):
+        h = int(height)
+        w = int(width)
+        at = int(first)
+        for _ in range(levels - 1 - up):
+            at += 4 * h * pitch_of(w)
+            h = (h + 1) / 2
+            w = (w + 1) / 2
+        pitch = pitch_of(w)
+        step = h * pitch
+        for y in range(h):
+            for x in range(w):
+                i = at + y * pitch + x
+                if cells[i + 3 * step] == 0.0:
+                    set_cell(cells, i, step, between(cells, at + 4 * step, h, w, y, x))
+
+
+@wp.func
+def fill(
+    total: wp.array[float],
+    here: int,
+    step: int,
+    height: int,
+    width: int,
+    scale: wp.array[float],
+    cells: wp.array[float],
+    first: int,
+):
+    """Pull-push of means with holes, as far as they are asked for. Returns 0 of nothing but holes.
+
+    Levels are made until one has no empty cell.
+    """
+    h = int((height + 1) / 2)
+    w = int((width + 1) / 2)
+    low = pull(total, here, step, height, width, cells, first)
+    at = int(first)
+    levels = int(1)
+    while low == 0.0 and (h > 1 or w > 1):
+        plane = h * pitch_of(w)
+        low = pull(cells, at, plane, h, w, cells, at + 4 * plane)
+        at += 4 * plane
+        h = (h + 1) / 2
+        w = (w + 1) / 2
+        levels += 1
+    if low == 0.0:
+        return 0
+    complete(cells, first, (height + 1) / 2, (width + 1) / 2, levels)
+    pitch = pitch_of(width)
+    for y in range(height):
+        for x in range(width):
+            i = y * pitch + x
+            if total[here + 3 * step + i] == 0.0 and scale[i] > 0.0:
+                set_cell(total, here + i, step, between(cells, first, height, width, y, x))
+    return 1

@@ -1,0 +1,79 @@
+"""Kernels that PoCL has compiled, kept for the next process.
+
+PoCL's own cache is not used as it is: processes that fill it at the same time race, and a damaged
+entry ends the process (pocl/pocl issues 430 and 1480). Here every process has a cache folder of its
+own, filled from one archive when the driver is loaded. At the end of a process that compiled
+something, its folder becomes the archive, replaced as a whole. Checksums are those of the archive:
+a damaged one counts for none. The folder is the operating system's to remove where a process was
+killed.
+"""
+
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
+import zipfile
+import zlib
+from importlib.resources import files
+from pathlib import Path
+
+from mmmgpu.errors import InputError
+from mmmgpu.files import atomic_path
+
+OWN = ("POCL_CACHE_DIR", "POCL_KERNEL_CACHE")  # who sets one of these has a cache of their own
+KEPT = ("*.bc", "*.so")  # programs and kernels; the rest is PoCL's scratch
+UNUSED = {"POCL_KERNEL_CACHE": "0"}
+
+
+def cache_variables() -> dict[str, str]:
+    """The environment in which PoCL's driver is to be loaded; to be called once in a process."""
+    if any(name in os.environ for name in OWN):
+        return UNUSED
+    folder = Path(tempfile.mkdtemp(prefix="mmmgpu-pocl-"))
+    archive = archive_path()
+    known = unpack(archive, folder)
+    atexit.register(keep, folder, archive, known)
+    return {"POCL_CACHE_DIR": str(folder), "POCL_KERNEL_CACHE": "1"}
+
+
+def archive_path() -> Path:
+    """Where the kernels of this version are kept; others are of no use."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    digest = hashlib.sha256()
+    for source in sorted(files("mmmgpu.kernels").iterdir(), key=lambda file: file.name):
+        if source.name.endswith(".cl"):
+            digest.update(source.read_bytes())
+    return home / "mmmgpu" / f"pocl-{digest.hexdigest()[:16]}.zip"
+
+
+def unpack(archive: Path, folder: Path) -> set[str]:
+    """Fill `folder` from the archive: the names of its files, none if it is missing or damaged."""
+    try:
+        with zipfile.ZipFile(archive) as packed:
+            packed.extractall(folder)
+            return set(packed.namelist())
+    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(exist_ok=True)
+        return set()
+
+
+def keep(folder: Path, archive: Path, known: set[str]) -> None:
+    """Make `folder` the archive if it holds more than what came from there, and remove it."""
+    try:
+        made = {str(path.relative_to(folder)) for suffix in KEPT for path in folder.rglob(suffix)}
+        if made - known:
+            archive.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(archive) as path, zipfile.ZipFile(path, "w") as packed:
+                for name in sorted(made):
+                    packed.write(folder / name, name)
+            for other in archive.parent.glob("pocl-*.zip"):
+                if other != archive:
+                    other.unlink(missing_ok=True)
+    except (
+        OSError,
+        InputError,
+    ):  # a full disk, or a home that cannot be written: compiled again next time
+        pass
+    shutil.rmtree(folder, ignore_errors=True)

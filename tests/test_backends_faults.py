@@ -1,0 +1,157 @@
+"""Drivers and devices that fail: one clear line, or less at a time."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+import warp as wp
+from numpy.testing import assert_array_equal
+from test_operations import CALLS, call, first
+
+from mmmgpu.backends import get_backend, nvwarp, opencl
+from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
+
+
+def driver_error(name, kind=cl.RuntimeError):
+    """The error that pyopencl raises for a status code."""
+    return kind(cl._cl._ErrorRecord("clRoutine failed", getattr(cl.status_code, name), "clRoutine"))
+
+
+def raising(error):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+def test_without_a_driver_opencl_says_what_to_install(monkeypatch):
+    error = driver_error("PLATFORM_NOT_FOUND_KHR", cl.LogicError)
+    monkeypatch.setattr(cl, "get_platforms", raising(error))
+    with pytest.raises(InputError, match=r"no OpenCL driver; pip install 'pyopencl\[pocl\]'"):
+        opencl.open_backend("", 1)
+    with pytest.raises(InputError, match="no OpenCL driver"):
+        opencl.list_devices()
+
+
+def test_a_platform_without_devices_does_not_hide_the_others(monkeypatch):
+    class Empty:
+        get_devices = staticmethod(raising(driver_error("DEVICE_NOT_FOUND")))
+
+    real = cl.get_platforms()
+    monkeypatch.setattr(cl, "get_platforms", lambda: [Empty(), *real])
+    assert opencl.open_backend("", 1).name == "opencl:1:0"
+    with pytest.raises(InputError, match=r"no device 'opencl:0:0'; present: opencl:1:0 \("):
+        opencl.open_backend("0:0", 1)
+
+
+def test_a_kernel_that_cannot_be_built_is_one_line_with_the_driver_s_reason(monkeypatch, tmp_path):
+    (tmp_path / "broken.cl").write_text("__kernel void f() { nonsense; }\n")
+    monkeypatch.setattr(opencl, "files", lambda _: tmp_path)
+    context = get_backend("opencl").queue.context
+    with pytest.raises(DeviceError, match=r"cannot build broken\.cl \(.*'nonsense'") as raised:
+        opencl._program(context, "broken")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("code", sorted(opencl.NO_MEMORY | opencl.GONE))
+def test_a_failure_of_the_driver_names_the_device(monkeypatch, code):
+    k = get_backend("opencl:0:0")
+    array = k.to_device(np.ones((1, 2, 2, 1), np.float32))
+    name = cl.status_code.to_string(code)
+    monkeypatch.setattr(cl, "enqueue_map_buffer", raising(driver_error(name)))
+    kind = DeviceMemoryError if code in opencl.NO_MEMORY else DeviceError
+    with pytest.raises(kind, match=rf"^opencl:0:0: .*{name}.* another (device )?with --backend$"):
+        k.to_host(array)
+
+
+def test_a_defect_of_ours_is_not_blamed_on_the_driver(monkeypatch):
+    k = get_backend("opencl")
+    array = k.to_device(np.ones((1, 2, 2, 1), np.float32))
+    monkeypatch.setattr(cl, "enqueue_map_buffer", raising(driver_error("INVALID_KERNEL_ARGS")))
+    with pytest.raises(cl.RuntimeError, match="INVALID_KERNEL_ARGS"):
+        k.to_host(array)
+    monkeypatch.setattr(wp, "launch", raising(RuntimeError("an argument is missing")))
+    with pytest.raises(RuntimeError, match="argument is missing") as raised:
+        call("blend", "warp")
+    assert not isinstance(raised.value, InputError)
+
+
+@pytest.mark.parametrize("function", ["launch", "synchronize_device"])
+def test_a_cuda_device_that_disappears_is_one_line(monkeypatch, function):
+    gone = RuntimeError("CUDA error 719 detected on device cpu: unspecified\nlaunch failure")
+    monkeypatch.setattr(wp, function, raising(gone))
+    with pytest.raises(DeviceError, match=r"^warp:cpu: the device failed \(CUDA error") as raised:
+        call("blend", "warp")
+    assert "\n" not in str(raised.value)
+    assert isinstance(raised.value, InputError)  # so that commands end with this line
+
+
+def test_an_array_that_is_too_large_for_the_device_is_said(backend):
+    with pytest.raises(DeviceMemoryError, match=rf"^{backend}:\S+: not enough memory \("):
+        get_backend(backend).empty(1 << 30, 1 << 14)
+
+
+def limit_memory(monkeypatch, backend, most):
+    """Let that device hold arrays of at most `most` items each; returns the sizes asked for."""
+    runtime = {"opencl": opencl.OpenCL, "warp": nvwarp.Warp}[backend]
+    asked, real = [], (runtime.empty, runtime.to_device)
+
+    def check(size):
+        asked.append(int(size))
+        if size > most:
+            raise DeviceMemoryError("not enough memory")
+
+    def empty(self, *shape, **options):
+        check(np.prod(shape))
+        return real[0](self, *shape, **options)
+
+    def to_device(self, array):
+        check(array.size)
+        return real[1](self, array)
+
+    monkeypatch.setattr(runtime, "empty", empty)
+    monkeypatch.setattr(runtime, "to_device", to_device)
+    return asked
+
+
+RNG = np.random.default_rng(0)
+MANY = {  # what is long along the axis that can be cut
+    "forward_warp": {
+        "field": RNG.random((7, 9, 8, 3), np.float32),
+        "flow": RNG.random((9, 8, 2), np.float32),
+    },
+    "fill_holes": {
+        "field": RNG.random((7, 9, 8, 3), np.float32),
+        "weight": RNG.random((7, 9, 8), np.float32),
+        "threshold": 0.2,
+    },
+    "blend": {"weights": RNG.random((40, 2), np.float32)},
+    "sample": {"field": RNG.random((7, 9, 8, 3), np.float32), "points": np.ones((7, 4, 2))},
+    "distance_scan": {
+        "queries": RNG.random((2, 20, 2), np.float32),
+        "corpus": RNG.random((17, 20, 2), np.float32),
+        "weights": np.ones(20, np.float32),
+    },
+    "evaluate_rbf": {"points": RNG.random((300, 2), np.float32)},
+    "piecewise_warp": {
+        "field": RNG.random((7, 9, 8, 3), np.float32),
+        "vertices": np.ones((7, 7, 2)),
+    },
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_what_does_not_fit_is_done_in_parts(monkeypatch, backend, name):
+    asked = limit_memory(monkeypatch, backend, np.inf)
+    whole = call(name, backend, **MANY[name])
+    most = max(asked) - 1
+    asked = limit_memory(monkeypatch, backend, most)
+    parts = call(name, backend, **MANY[name])
+    assert max(asked) > most  # it was tried
+    assert_array_equal(first(parts), first(whole))
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_one_item_that_does_not_fit_is_an_error(monkeypatch, backend, name):
+    limit_memory(monkeypatch, backend, 1)
+    with pytest.raises(DeviceMemoryError, match="not enough memory"):
+        call(name, backend, **MANY[name])

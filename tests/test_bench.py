@@ -1,0 +1,303 @@
+"""The benchmarks: right answers before times, honest counts, and what a comparison calls slower."""
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from commands import assert_refused, run_command
+
+from mmmgpu.backends import BACKENDS
+from mmmgpu.bench import cases, growth, machine, peers, pipeline, runs, startup
+from mmmgpu.bench.charts import draw_growth
+from mmmgpu.bench.comparison import compare_runs
+from mmmgpu.bench.endurance import measure_endurance
+from mmmgpu.bench.kernels import kernel_work
+from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
+from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
+from mmmgpu.bench.targets import judge_targets
+from mmmgpu.bench.timing import Contender, Effort, Work, measure, take_turns
+from mmmgpu.errors import InputError
+from mmmgpu.progress import progress
+
+ONCE = Effort(turns=1, seconds=0.0)
+OURS = ("opencl", "warp")
+PEERS, _ = peers.split_by_presence(peers.LIBRARIES)
+SMALL = {
+    "splat": {"batch": 2, "height": 24, "width": 20, "channels": 3},
+    "fill": {"batch": 2, "height": 15, "width": 18},
+    "blend": {"number": 3, "height": 9, "width": 7},
+    "sample": {"height": 12, "width": 17},
+    "sample_at_random": {"height": 12, "width": 17},
+    "scan": {"queries": 3, "corpus": 5, "points": 40},
+    "rbf": {"height": 12, "width": 9, "number": 8},
+    "piecewise": {"batch": 2},
+}
+
+
+def small(make):
+    return partial(make, **SMALL[make.__name__])
+
+
+@pytest.mark.parametrize("make", cases.CASES, ids=lambda f: f.__name__)
+def test_all_contenders_of_a_kernel_give_the_answer_of_the_reference(make):
+    found = measure(kernel_work(small(make), OURS, PEERS), ONCE)["contenders"]
+    assert {*OURS, "reference"} <= found.keys()
+    differences = [row["difference"] for who, row in found.items() if who != "reference"]
+    assert max(differences) < 1e-4
+
+
+@pytest.mark.parametrize("make", cases.CASES, ids=lambda f: f.__name__)
+def test_bytes_are_those_of_the_arguments_and_the_answer(make):
+    case = small(make)(np.random.default_rng(0))
+    answer = kernel_work(small(make), ["numpy"], []).contenders["numpy"].load()()
+    arrays = answer if isinstance(answer, tuple) else (answer,)
+    assert case.bytes == sum(a.nbytes for a in (*case.arrays, *arrays))
+    assert case.operations > 0
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        partial(synthesis_work, OURS, ["opencv"], prototypes=4, side=48, frames=2),
+        partial(mouths_work, OURS, prototypes=4, side=48, frames=2),
+        partial(analysis_work, OURS, prototypes=6, side=48, frames=2),
+        partial(matching_work, OURS, prototypes=4, frames=6, side=32),
+        partial(trajectory_work, ["scipy"], seconds=1),
+        partial(gdlr_work, seconds=1),
+        partial(training_work, seconds=2, dimensions=1),
+    ],
+    ids=lambda work: work.func.__name__,
+)
+def test_all_contenders_of_a_whole_give_the_answer_of_the_reference(work):
+    made = work()
+    found = measure(made, ONCE)["contenders"]
+    assert found.keys() == {*made.contenders, "reference"}
+    ours = [who for who, contender in made.contenders.items() if contender.tolerance is not None]
+    assert all(found[who]["difference"] <= made.contenders[who].tolerance for who in ours)
+    assert ours
+
+
+def test_a_wrong_answer_is_not_timed():
+    right, wrong = np.array([1.0, 2.0]), np.array([1.0, 2.1])
+    contenders = {"fast": Contender(lambda: lambda: wrong, tolerance=1e-3)}
+    with pytest.raises(InputError, match=r"sums, fast: differs .* by 5.0e-02"):
+        measure(Work("sums", lambda: right, contenders), ONCE)
+
+
+def test_an_answer_that_is_no_number_is_not_timed():
+    contenders = {"fast": Contender(lambda: lambda: np.array([np.nan]), tolerance=1e-3)}
+    with pytest.raises(InputError, match="differs"):
+        measure(Work("sums", lambda: np.ones(1), contenders), ONCE)
+
+
+def test_contenders_take_turns():
+    order = []
+    runs = {name: partial(order.append, name) for name in "ab"}
+    seconds = take_turns(runs, Effort(turns=3, seconds=0.0))
+    assert order == list("ab" * 4)  # the first round is not counted
+    assert [s.shape for s in seconds.values()] == [(2, 3), (2, 3)]
+
+
+def test_the_processor_s_time_is_that_of_all_threads():
+    def spin():
+        end = time.thread_time() + 0.05
+        while time.thread_time() < end:
+            pass
+
+    def three():
+        threads = [threading.Thread(target=spin) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return np.ones(1)
+
+    work = Work("w", lambda: np.ones(1), {"a": Contender(lambda: three)})
+    assert measure(work, ONCE)["contenders"]["a"]["cpu_ms"] > 149
+
+
+def test_the_reference_s_part_counts_for_the_whole():
+    work = Work("w", lambda: np.ones(2), {"a": Contender(lambda: lambda: np.ones(4))}, part=1e-6)
+    found = measure(work, ONCE)["contenders"]
+    assert found["reference"]["median_ms"] > 100 * found["a"]["median_ms"]
+
+
+def test_a_library_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(peers.LIBRARIES, "fortran", "peers_fortran")
+    present, absent = peers.split_by_presence(peers.LIBRARIES)
+    assert absent[-1] == "fortran"
+    assert {"numpy", "opencv", "scipy"} <= set(present)
+
+
+def run_of(**medians):
+    """A record with works of one contender a name, quartiles 2 % around the medians."""
+    rows = {
+        who: {"median_ms": ms, "quartiles_ms": [0.98 * ms, 1.02 * ms]}
+        for who, ms in medians.items()
+    }
+    works = {"blend": {"name": "blend", "contenders": rows}}
+    return {"machine": {"cpu": "x", "threads": 2, "commit": "a"}, "works": works}
+
+
+@pytest.mark.parametrize(
+    ("new", "verdict", "times"),
+    [
+        ({"warp": 10, "numba": 5, "reference": 50}, "-", 1),
+        ({"warp": 20, "numba": 10, "reference": 100}, "-", 1),  # so has everything else
+        ({"warp": 12, "numba": 5, "reference": 50}, "slower", 1.2),
+        ({"warp": 12, "numba": 10, "reference": 100}, "faster", 0.6),
+        ({"warp": 10.3, "numba": 5, "reference": 50}, "-", 1.03),
+    ],
+)
+def test_slower_is_judged_beyond_noise_and_drift(new, verdict, times):
+    (row,) = compare_runs(run_of(warp=10, numba=5, reference=50), run_of(**new))["rows"]
+    assert (row["verdict"], row["times"]) == (verdict, pytest.approx(times, abs=1e-3))
+
+
+def test_overlapping_quartiles_are_noise():
+    old, new = run_of(warp=10, numba=5), run_of(warp=14, numba=5)
+    new["works"]["blend"]["contenders"]["warp"]["quartiles_ms"] = [10.1, 15]
+    assert compare_runs(old, new)["rows"][0]["verdict"] == "-"
+
+
+def test_works_of_other_sizes_are_not_compared():
+    other = run_of(warp=10)
+    other["works"]["blend"]["name"] = "a larger blend"
+    with pytest.raises(InputError, match="no work in common"):
+        compare_runs(run_of(warp=10), other)
+
+
+def test_a_target_is_met_or_not_by_the_best_backend():
+    results = run_of(warp=4, opencl=9, numba=5, **{"numpy peer": 14})
+    results["machine"]["copy_gb_per_s"] = 10
+    results["works"]["blend"] |= {"bytes": 36e6, "items": 1}
+    results["works"]["splat"] = results["works"]["rbf"] = results["works"]["blend"]
+    found = judge_targets(results)
+    values = {name: (t["value"], t["met"]) for name, t in found.items()}
+    assert values["forward_warp over numba"] == (1.25, False)
+    assert values["dense RBF over NumPy"] == (3.5, True)
+    assert values["blend, passes over its bytes"] == (1.11, True)
+    assert values["backends apart by at most"] == (2.25, False)
+    assert "analysis [frames/s]" not in found  # nothing was measured
+
+
+@pytest.mark.parametrize("power", [0.5, 1, 2])
+def test_the_exponent_of_growth_is_that_of_the_power_law(monkeypatch, power):
+    axis = (2, 4, 8), lambda name, n: lambda: n, int
+    monkeypatch.setitem(growth.AXES, "pages", axis)
+    monkeypatch.setattr(growth, "timed", lambda run: (0.1 * run() ** power, 0))
+    assert growth.grown("pages", "warp")["exponent"] == pytest.approx(power)
+
+
+def test_the_gain_of_threads_is_of_the_best_times():
+    def made(copy, *ms):
+        rows = {"warp": {"best_ms": ms[0], "first_ms": 1}, "reference": {"best_ms": ms[1]}}
+        works = {"scan": {"contenders": rows}}
+        return {"machine": {"copy_gb_per_s": copy}, "works": works}
+
+    assert growth.best_of([made(5, 8, 1), made(4, 6, 2)]) == {"copy": 0.2, "scan, warp": 6}
+
+
+def test_charts_say_the_exponents(tmp_path):
+    found = {"counts": [1, 2000], "best_ms": [1.0, 2.0], "exponent": 0.125}
+    chart = tmp_path / "growth.svg"
+    draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, chart)
+    assert "warp: 0.12" in chart.read_text()
+    with pytest.raises(InputError, match=r"must be named \.svg"):
+        draw_growth({}, tmp_path / "growth.png")
+
+
+def test_many_frames_leave_nothing_behind(backend):
+    found = measure_endurance([backend], 400, side=32)[backend]
+    memory, files = found["resident_mb"], found["open_files"]
+    assert len(memory) == 50
+    assert max(memory[-10:]) - max(memory[15:25]) < 2
+    assert files[-1] == files[10]
+
+
+def test_a_first_frame_that_fails_says_why(tmp_path):
+    assert startup.first_frame("numpy", str(tmp_path)) > 0.1
+    with pytest.raises(InputError, match=r"no first frame on warp:cuda:99: .*there is no device"):
+        startup.first_frame("warp:cuda:99", str(tmp_path))
+
+
+def test_a_profile_names_the_innermost_function_of_ours():
+    places = []
+
+    def items():
+        places.append(pipeline.place(sys._getframe()))
+        yield 1
+
+    assert list(progress(items(), "x", quiet=True)) == [1]
+    assert places == ["progress.progress"]
+    growth.timed(lambda: next(items()))
+    assert places[1] is None  # the benchmarks themselves do not count
+
+
+def test_a_thread_that_waits_is_not_in_the_profile():
+    thread = threading.Thread(target=(event := threading.Event()).wait)
+    thread.start()
+    while sys._current_frames()[thread.ident].f_code.co_name != "wait":
+        time.sleep(0.001)
+    assert pipeline.place(sys._current_frames()[thread.ident]) is None
+    event.set()
+    thread.join()
+
+
+def test_the_command_writes_a_record_and_compares_it(tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(machine, "COPIED", 1 << 20)
+    mmmgpu, out = partial(run_command, capfd), tmp_path / "one.json"
+    ended = mmmgpu("bench", "--quick", "--part", "kernels", "--only", "blend", "--json", out)
+    assert ended.status == 0
+    assert all(f"\n  {name} " in ended.out for name in ("warp", "opencl", "reference"))
+    results = json.loads(out.read_text())
+    row = results["works"]["blend"]["contenders"]["warp"]
+    assert {"median_ms", "quartiles_ms", "first_ms", "transfer_ms", "bandwidth"} <= row.keys()
+    assert {"commit", "cpu", "threads", "versions", "copy_gb_per_s"} <= results["machine"].keys()
+    ended = mmmgpu("bench", "compare", out, out)
+    assert ended.status == 0
+    assert "drift of the machine 1" in ended.out
+
+
+def test_a_pipeline_without_a_voice_is_said_and_left_out(monkeypatch):
+    monkeypatch.setattr(runs, "is_installed", lambda: False)
+    monkeypatch.setattr(machine, "COPIED", 1 << 20)
+    found = runs.run_benchmarks(runs.Plan(parts=["pipeline"]))
+    assert "pipeline" not in found
+    assert found["absent"] == ["a voice for the pipeline (mmmgpu[tts])"]
+
+
+def test_the_commit_is_not_that_of_another_project_around(monkeypatch, tmp_path):
+    author = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for call in (["init", "-q"], [*author, "commit", "-q", "--allow-empty", "-m", "other"]):
+        subprocess.run(["git", "-C", tmp_path, *call], check=True, capture_output=True)
+    monkeypatch.setattr(machine, "__file__", str(tmp_path / "machine.py"))
+    assert machine.commit() is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--part", "poetry"], ["no part 'poetry'", "kernels"]),
+        (["--part", "kernels", "--only", "waltz"], ["no work 'waltz'", "splat"]),
+        (["--backend", "abacus"], ["unknown backend 'abacus'"]),
+    ],
+)
+def test_what_is_not_there_is_refused_with_what_is(capfd, arguments, words):
+    assert_refused(run_command(capfd, "bench", "--quick", *arguments), *words)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"version": 99}'])
+def test_a_file_that_is_no_record_is_refused(tmp_path, capfd, text):
+    path = tmp_path / "results.json"
+    path.write_text(text)
+    assert_refused(run_command(capfd, "bench", "compare", path, path), path.name)
+
+
+def test_every_backend_but_the_reference_has_targets():
+    assert {*OURS} == BACKENDS.keys() - {"numpy"}
