@@ -13,19 +13,18 @@ edges of teeth and lips are sharper than that, they would count as different tex
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.analysis import solve_simplex
-from mmmgpu.backends import default_threads, get_backend
+from mmmgpu.backends import get_backend
+from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import MOUTH, Basis
 from mmmgpu.flow_matching import FlowScan, View, nearest_view, synthetic_flows
-from mmmgpu.parallel import map_ordered
-from mmmgpu.synthesis import NO_TEXTURE, warp_prototypes
+from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -103,7 +102,7 @@ def match_prototypes(
 
     beta = texture_coordinates(source, views, view, backend=backend)
     flows = synthetic_flows(views, view, target.w_t.shape, calibration)
-    texture_scan = _TextureScan(target, [views[r].flows_b for r in view], flows, beta, backend)
+    texture_scan = _TextureScan(target, views, view, flows, beta, backend)
     texture = texture_scan(start)
     unit = _median(texture)
     apart = [texture[rows, start] / unit]
@@ -158,56 +157,53 @@ def texture_coordinates(
     source: Basis, views: Sequence[View], view: Numbers, *, backend: str = "warp"
 ) -> Floats:
     """Eq. 8: beta_{i,k} of prototype k of A in the other prototypes, column k, (M, M)."""
-    kernels = get_backend(backend, 1)
-    bases = [replace(source, flows=v.flows_a) for v in views]
-    pixels = np.flatnonzero(source.w_t > MOUTH)
-    weight = np.sqrt(source.w_t.ravel()[pixels])
-    every = np.arange(len(view))
-
-    def one(k: int, _: Any) -> Floats:
-        others = every[every != k]
-        basis = bases[view[k]]
-        warped = kernels.to_host(warp_prototypes(basis, basis.flows[k], others, kernels))
-        warped = warped.reshape(len(others), -1, 3)
-        column = np.zeros(len(every))
-        column[others] = _fit_mixture(warped, source.images[k], pixels, weight)
-        return column
-
-    return np.stack(list(map_ordered(one, every.tolist(), threads=default_threads())), axis=1)
-
-
-def _fit_mixture(warped: F32, image: F32, pixels: NDArray[np.int64], weight: F32) -> Floats:
-    """The weights (n,) on the simplex with which pictures mix to `image` best.
-
-    warped: (n, h w, 3). image: (h, w, 3). pixels, weight: those that count, and sqrt(w_t) there.
-    """
-    a = (warped[:, pixels] * weight[:, None]).reshape(len(warped), -1)
-    b = (image.reshape(-1, 3)[pixels] * weight[:, None]).ravel()
-    return solve_simplex(a @ a.T, a @ b)
+    kernels = get_backend(backend)
+    root = np.where(source.w_t > MOUTH, np.sqrt(source.w_t), 0).astype(np.float32)[..., None]
+    scale = kernels.to_device(planes(root)[0])
+    wanted = planes(source.images * root).reshape(len(view), -1)
+    every, beta = np.arange(len(view), dtype=np.int32), np.zeros((len(view), len(view)))
+    for r, v in enumerate(views):
+        mine = np.flatnonzero(view == r)
+        held = kernels.hold_prototypes(source.images, v.flows_a, HOLE) if len(mine) else None
+        for k in mine:
+            others = every[every != k]
+            flow, used = map(kernels.to_device, (planes(v.flows_a[k : k + 1]), others))
+            moved = kernels.to_host(kernels.move_prototypes(held, flow, used, scale))
+            a = moved.reshape(len(others), -1)
+            beta[others, k] = solve_simplex(a @ a.T, a @ wanted[k])
+    return beta
 
 
 class _TextureScan:
     """Eq. 9-10 for changing candidates: distances (M, N), mean over B's pixels under w_t.
 
-    own: Flows of B's frames in the view of each prototype, M times (N, h', w', 2).
-    flows: Those that the prototypes have in B's face, (M, h', w', 2).
-
-    A synthesis whose own candidates have not changed is not made again.
+    flows: Those that the prototypes have in B's face, (M, h', w', 2). beta: of Eq. 8.
     """
 
-    def __init__(self, target: Basis, own: Sequence[F32], flows: F32, beta: Floats, backend: str):
-        self._target, self._own, self._flows, self._beta = target, own, flows, beta
-        self._kernels, self._one = get_backend(backend), get_backend(backend, 1)
+    def __init__(
+        self,
+        target: Basis,
+        views: Sequence[View],
+        view: Numbers,
+        flows: F32,
+        beta: Floats,
+        backend: str,
+    ):
+        self._target, self._views, self._view = target, views, view
+        self._kernels = get_backend(backend)
+        self._flows, self._beta = planes(flows), np.where(beta > NO_TEXTURE, beta, 0)
         self._pixels = np.flatnonzero(target.w_t > MOUTH)
         weight = target.w_t.ravel()[self._pixels]
         frames = np.stack([self._seen(image) for image in target.images])
         self._frames, self._weight = map(self._kernels.to_device, (frames, weight / weight.sum()))
-        self._made: dict[int, tuple[bytes, F32]] = {}
 
     def __call__(self, candidates: Numbers) -> Floats:
-        work = [(k, candidates) for k in range(len(self._flows))]
-        made = list(map_ordered(self._synthesis, work, threads=default_threads()))
-        queries = self._kernels.to_device(np.stack(made))
+        made = np.empty((len(self._view), len(self._pixels), 3), np.float32)
+        for r in range(len(self._views)):
+            mine = np.flatnonzero(self._view == r)
+            if len(mine):
+                made[mine] = self._syntheses(r, mine, candidates)
+        queries = self._kernels.to_device(made)
         scanned = self._kernels.distance_scan(queries, self._frames, self._weight)
         return np.asarray(self._kernels.to_host(scanned), np.float64)
 
@@ -216,18 +212,20 @@ class _TextureScan:
         smooth = cv2.GaussianBlur(image, (0, 0), SMOOTHED * self._target.region.mouth[2])
         return np.asarray(smooth.reshape(-1, 3)[self._pixels], np.float32)
 
-    def _synthesis(self, item: tuple[int, Numbers], _: Any) -> F32:
-        """I_syn,k at the pixels that count, (P, 3)."""
-        k, candidates = item
-        used = np.flatnonzero(self._beta[:, k] > NO_TEXTURE)
-        frames = candidates[used]
-        known = self._made.get(k)
-        if known is not None and known[0] == frames.tobytes():
-            return known[1]
-        images, flows = self._target.images[frames], self._own[k][frames]
-        basis = replace(self._target, images=images, flows=flows)
-        every = np.arange(len(used))
-        warped = self._one.to_host(warp_prototypes(basis, self._flows[k], every, self._one))
-        made = self._seen(np.tensordot(self._beta[used, k].astype(np.float32), warped, axes=1))
-        self._made[k] = (frames.tobytes(), made)
-        return made
+    def _syntheses(self, r: int, mine: Numbers, candidates: Numbers) -> F32:
+        """I_syn of the prototypes `mine` (K,), all of view r, at the pixels that count, (K, P, 3).
+
+        A frame that is the candidate of several prototypes is warped once.
+        """
+        k, beta = self._kernels, self._beta[:, mine]
+        used = np.flatnonzero(beta.any(axis=1))
+        frames, which = np.unique(candidates[used], return_inverse=True)
+        weights = np.zeros((len(frames), len(mine)))
+        np.add.at(weights, which, beta[used])
+        images, flows = self._target.images[frames], self._views[r].flows_b[frames]
+        height, width = self._target.w_t.shape
+        everywhere = np.ones((height, self._flows.shape[-1]), np.float32)
+        given = self._flows[mine], weights.T.astype(np.float32, order="C"), everywhere
+        held = k.hold_prototypes(images, flows, HOLE)
+        made = k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
+        return np.stack([self._seen(picture(one, width)) for one in made])

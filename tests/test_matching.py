@@ -12,6 +12,7 @@ from tiny_pair import COUNT, FRAMES, tiny_pair
 
 from mmmgpu import matching
 from mmmgpu.analysis import TEXTURE_RIDGE, solve_simplex
+from mmmgpu.backends import get_backend
 from mmmgpu.flow_matching import synthetic_flows
 from mmmgpu.matching import match_prototypes, texture_coordinates
 
@@ -31,8 +32,7 @@ def test_texture_coordinates_are_equation_8(tiny, backend):
 
 def scan_of(tiny, beta, backend):
     flows = synthetic_flows(tiny.views, tiny.view, tiny.target.w_t.shape)
-    own = [tiny.views[r].flows_b for r in tiny.view]
-    return matching._TextureScan(tiny.target, own, flows, beta, backend)
+    return matching._TextureScan(tiny.target, tiny.views, tiny.view, flows, beta, backend)
 
 
 def test_the_texture_scan_is_equations_9_and_10(tiny, backend):
@@ -53,22 +53,6 @@ def test_the_texture_scan_is_equations_9_and_10(tiny, backend):
         assert_allclose(scan(candidates), wanted, rtol=1e-4)
         scan(np.array([3, 2, 2, 6, 0]))  # what was made before is not taken for what is new
         assert_allclose(scan(candidates), wanted, rtol=1e-4)
-
-
-def test_a_synthesis_whose_candidates_stay_is_not_made_again(tiny, monkeypatch):
-    beta = np.eye(COUNT)[:, [1, 0, 1, 2, 3]]
-    scan = scan_of(tiny, beta, "numpy")
-    scan(np.array([0, 1, 2, 3, 4]))
-    real, made = matching.warp_prototypes, []
-
-    def counted(basis, *rest):
-        made.append(basis.images)
-        return real(basis, *rest)
-
-    monkeypatch.setattr(matching, "warp_prototypes", counted)
-    scan(np.array([0, 1, 5, 3, 6]))  # 2 is used for prototype 3 alone, 4 for none
-    assert len(made) == 1
-    assert_array_equal(made[0], tiny.target.images[[5]])
 
 
 @pytest.mark.parametrize("equal", [False, True])
@@ -255,7 +239,7 @@ def test_the_same_bits_twice_and_on_any_number_of_threads(tiny, backend, monkeyp
     first = bits()
     assert bits() == first
     for threads in (1, 5):
-        monkeypatch.setattr(matching, "default_threads", lambda n=threads: n)
+        monkeypatch.setattr(matching, "get_backend", lambda name, n=threads: get_backend(name, n))
         assert bits() == first
 
 
