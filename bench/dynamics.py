@@ -2,8 +2,9 @@
 
 Peers are given the same parameters and data; their answers are compared first, then each pair takes
 turns. hmmlearn's Gaussian densities stand beside the HMM mean (it evaluates all states of every
-frame), statsmodels' Kalman smoother beside that of SLDS: it knows matrices only, ours is timed with
-diagonals and with matrices. Frames a second are of one core.
+frame), nnmnkwii's maximum-likelihood parameter generation beside Brand's trajectories, statsmodels'
+Kalman smoother beside that of SLDS: it knows matrices only, ours is timed with diagonals and with
+matrices. Frames a second are of one core.
 """
 
 import argparse
@@ -12,13 +13,14 @@ import json
 import sys
 import time
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 from hmmlearn.stats import log_multivariate_normal_density
 from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 from threadpoolctl import threadpool_limits
 
-from mmmgpu.dynamics import MODELS
+from mmmgpu.dynamics import MODELS, trajectory
 from mmmgpu.kalman import smooth
 from mmmgpu.labelled import Labelled, batches, find_rows
 
@@ -55,6 +57,25 @@ def gaussians_of_hmmlearn(model, y, labels):
         return np.array(values)
 
     return run
+
+
+def trajectories_of_nnmnkwii(model, labels):
+    """Brand's trajectories by MLPG with features and their differences.
+
+    It takes no account of differences in the first and the last frame: a frame more at the end, in
+    which nothing is tied to the others, makes the last one count, as ours does.
+    """
+    from nnmnkwii.paramgen import mlpg
+
+    windows = [(0, 0, np.ones(1)), (1, 0, np.array([-1.0, 1.0]))]
+
+    def one(own):
+        rows = find_rows(model.labels, [*own, own[-1]])
+        mean = np.concatenate([model.mean[rows], model.step_mean[rows]], axis=1)
+        variance = np.concatenate([model.variance[rows], model.step_variance[rows]], axis=1)
+        return mlpg(mean, variance, windows)[:-1]
+
+    return lambda: np.stack([one(own) for own in labels])
 
 
 def smoother_of_statsmodels(model, y, labels):
@@ -157,11 +178,14 @@ def main(arguments):
         y, labels = drawn(np.random.default_rng(0))
         streaming = ("hmm", "slds", "dpds")
         models = {name: MODELS[name].fit(y, labels) for name in streaming}
-        hmm, slds = models["hmm"], models["slds"]
+        hmm, slds, brand = models["hmm"], models["slds"], MODELS["brand"].fit(y, labels)
 
         def likelihoods():
             pairs = zip(y, labels, strict=True)
             return np.array([hmm.log_likelihood(one, own) for one, own in pairs])
+
+        def trajectories():
+            return np.stack([trajectory(brand, own) for own in labels])
 
         peer = gaussians_of_hmmlearn(hmm, y, labels)
         theirs = smoother_of_statsmodels(slds, y, labels)
@@ -173,6 +197,12 @@ def main(arguments):
             "statsmodels, full": against("smoother, full", full, theirs, options.repeat),
             "frames_per_second": speeds(models, labels, options.frames),
         }
+        if find_spec("nnmnkwii"):
+            peer = trajectories_of_nnmnkwii(brand, labels)
+            found = against("trajectory, nnmnkwii", trajectories, peer, options.repeat)
+            results["nnmnkwii"] = found
+        else:
+            print("trajectory: no peer; pip install 'mmmgpu[peers]' compiles nnmnkwii")
     if options.json:
         with open(options.json, "w", encoding="utf-8") as file:
             json.dump(results, file, indent=1)

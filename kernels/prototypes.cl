@@ -160,11 +160,11 @@ void normalise(__global float *total, const int step, const int area, const floa
 }
 
 /* Write the means, or add them, and empty the accumulator. */
-void show(__global float *total, const int step, const int area, const float enough,
+void show(__global float *total, const int step, const int area, const float hole,
           const float weight, __global const float *scale, const int more, __global float *out)
 {
     for (int i = 0; i < area; i += LANES) {
-        const float16 share = weight * (get(scale + i) * share_of(get(total + 3 * step + i), enough));
+        const float16 share = weight * (get(scale + i) * share_of(get(total + 3 * step + i), hole));
         for (int c = 0; c < 3; ++c) {
             __global float *at = total + c * step + i;
             float16 colour = share * get(at);
@@ -243,14 +243,12 @@ __kernel void mix_prototypes(
             orient(members[part], fixed, firsts, deltas, shares, rows, targets, starts, row_taps,
                    row_shares, area, nodes, field, residual);
             splat(members[part], textures, height, width, pitch, residual, total, step);
-            float enough = hole;
             if (least_asked(total + 3 * step, area, scale) < hole) {
                 normalise(total, step, area, hole);
-                enough = 0.5f;
                 const int some = fill(total, step, height, width, scale, cells);
                 arrived[job] = some < arrived[job] ? some : arrived[job];
             }
-            show(total, step, area, enough, weights[part] / WHITE, scale, part > parts[job], out);
+            show(total, step, area, hole, weights[part] / WHITE, scale, part > parts[job], out);
         }
     }
 }

@@ -251,7 +251,7 @@ def show(
     here: int,
     step: int,
     area: int,
-    enough: float,
+    hole: float,
     weight: float,
     scale: wp.array[float],
     more: int,
@@ -261,7 +261,7 @@ def show(
     """Write the means, or add them, and empty the accumulator."""
     for i in range(0, area, LANES):
         n = get(total, here + 3 * step + i)
-        share = weight * wp.cw_mul(get(scale, i), share_of(n, enough))
+        share = weight * wp.cw_mul(get(scale, i), share_of(n, hole))
         for c in range(3):
             at = here + c * step + i
             colour = wp.cw_mul(share, get(total, at))
@@ -361,12 +361,10 @@ def mix_prototypes(
                 here,
                 step,
             )
-            enough = float(hole)
             if least_asked(total, here + 3 * step, area, scale) < hole:
                 normalise(total, here, step, area, hole)
-                enough = 0.5
                 some = fill(total, here, step, height, width, scale, cells, 4 * worker * size)
                 arrived[job] = wp.min(arrived[job], some)
             more = wp.where(part > parts[job], 1, 0)
             out = 3 * job * area
-            show(total, here, step, area, enough, weights[part] / WHITE, scale, more, mixed, out)
+            show(total, here, step, area, hole, weights[part] / WHITE, scale, more, mixed, out)

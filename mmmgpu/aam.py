@@ -6,7 +6,7 @@
         ...
 
 This module is the door; the work is in `mmmgpu.aam_training`, `mmmgpu.appearances`,
-`mmmgpu.aam_fitting`, `mmmgpu.aam_rendering` and `mmmgpu.aam_files`.
+`mmmgpu.aam_fitting`, `mmmgpu.aam_tracking`, `mmmgpu.aam_rendering` and `mmmgpu.aam_files`.
 """
 
 from collections.abc import Iterator
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mmmgpu.aam_files import load_aam, save_aam
 from mmmgpu.aam_fitting import Fitter, Match, match, prepare_fitting
 from mmmgpu.aam_rendering import render_face
+from mmmgpu.aam_tracking import Start, Tracked, start_in_box, track_clip
 from mmmgpu.aam_training import fit_aam
 from mmmgpu.appearances import Aam, Seen, see
 from mmmgpu.backends import default_threads, get_backend
@@ -31,6 +32,8 @@ __all__ = [
     "Fitter",
     "Match",
     "Seen",
+    "Start",
+    "Tracked",
     "complete_clip",
     "features",
     "fit_aam",
@@ -41,7 +44,8 @@ __all__ = [
     "reconstruct",
     "save_aam",
     "see_clip",
-    "track",
+    "start_in_box",
+    "track_clip",
 ]
 
 Floats = NDArray[np.float64]
@@ -101,21 +105,6 @@ def reconstruct(
         return render_face(aam, frame, labelled.points[t], c[t], kernels, where=where)
 
     yield from map_ordered(one, enumerate(read_frames(labelled.path)), threads=default_threads())
-
-
-def track(aam: Aam, clip: Path, start: Floats, *, backend: str = "warp") -> Iterator[Match]:
-    """The model fitted to one frame of `clip` after the other, each from the one before.
-
-    start: points of the first frame, (N, 2) [px], some pixels off at most.
-
-    Raises:
-        InputError: The clip cannot be read, or `start` is not so many points.
-    """
-    fitter, kernels, points = prepare_fitting(aam), get_backend(backend, 1), start
-    for frame in read_frames(clip):
-        found = match(fitter, frame, points, kernels)
-        points = found.shape
-        yield found
 
 
 def complete_clip(aam: Aam, clip: Path, landmarks: Path) -> LabelledClip:

@@ -4,7 +4,7 @@ Frames are read one at a time. What is learned from is a bounded number of frame
 over all clips, so that memory does not grow with them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +27,14 @@ from mmmgpu.meshes import Mesh, doubled_areas, fold_depths, make_mesh, triangula
 from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.progress import progress
 from mmmgpu.shapes import align, procrustes_mean
-from mmmgpu.videos import read_frames
+from mmmgpu.videos import read_chosen_frames
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 LARGEST = 20_000  # pixels of the mean shape; larger frames are reduced
+PARAMETERS = 32  # features of a frame, as in ECR07
 SHAPE_SHARE = 0.99  # of the variance of shapes that fitting follows; the rest is jitter
 TEXTURES = 8  # modes that fitting looks through; with many of them even a jaw can be explained
 FOLDED = 0.1  # of a shape's size: a triangle that is turned over by more is an error
@@ -45,7 +46,7 @@ def fit_aam(
     clips: Sequence[Path],
     landmarks: Path,
     *,
-    parameters: int = 32,
+    parameters: int | None = None,
     variance: float | None = None,
     rows: Rows | None = ROWS,
     frames: int = 1000,
@@ -56,7 +57,7 @@ def fit_aam(
     Args:
         clips: Video files of one person.
         landmarks: Folder with ``NAME.npz`` or ``NAME.json`` for every clip.
-        parameters: Length of the features.
+        parameters: Length of the features; `PARAMETERS`, if `variance` is not given either.
         variance: In place of `parameters`: the share of the variance that they must have, (0, 1].
         rows: Which landmarks of a frame are used; None: all of them.
         frames: Learned from at most; evenly spread over the clips.
@@ -66,11 +67,12 @@ def fit_aam(
         InputError: A clip or its landmarks cannot be used, or there are too few frames.
     """
     _check_options(parameters, variance, frames)
+    number = PARAMETERS if parameters is None else parameters
     with one_thread_each():
         labelled = read_labelled_clips([Path(c) for c in clips], Path(landmarks), rows)
         sample = _spread(labelled, frames)
         points = np.concatenate([c.points[i] for c, i in zip(labelled, sample, strict=True)])
-        _check_number(len(points), parameters if variance is None else 1)
+        _check_number(len(points), number if variance is None else 1)
         steady = steadiness(rows, points.shape[1])
         mesh, reduction = _mean_mesh(points, steady)
         _check_folds(labelled, mesh, reduction)
@@ -85,7 +87,7 @@ def fit_aam(
         weight = _weight(shape_gram, texture_gram)
         shape, texture = principal_components(shape_gram), principal_components(texture_gram)
         both = principal_components(weight**2 * shape_gram + texture_gram)
-        n = _count(both, parameters, variance)
+        n = _count(both, number, variance)
         k, m = shape.count_for(SHAPE_SHARE), min(TEXTURES, len(texture.variance))
         return Aam(
             mesh=mesh,
@@ -106,8 +108,10 @@ def fit_aam(
         )
 
 
-def _check_options(parameters: int, variance: float | None, frames: int) -> None:
-    if parameters < 1:
+def _check_options(parameters: int | None, variance: float | None, frames: int) -> None:
+    if parameters is not None and variance is not None:
+        raise InputError("parameters and variance: either says how many features; give one of them")
+    if parameters is not None and parameters < 1:
         raise InputError(f"parameters must be at least 1, got {parameters}")
     if variance is not None and not 0 < variance <= 1:
         raise InputError(f"variance must be a share above 0, at most 1, got {variance}")
@@ -175,7 +179,7 @@ def _read_textures(
     def one(item: tuple[LabelledClip, Numbers], _: Cancelled) -> F32:
         clip, chosen = item
         at = reduce_points(clip.points[chosen], reduction)
-        pictures = _chosen_frames(clip, clip.frames[chosen])
+        pictures = read_chosen_frames(clip.path, clip.frames[chosen])
         read = [
             read_texture(mesh, reduce_picture(picture, reduction), p, kernels)
             for picture, p in zip(pictures, at, strict=True)
@@ -190,17 +194,6 @@ def _read_textures(
         textures[end : end + len(part)] = part
         end += len(part)
     return textures
-
-
-def _chosen_frames(clip: LabelledClip, chosen: Numbers) -> Iterator[NDArray[np.uint8]]:
-    """The frames `chosen`, rising, of a clip."""
-    if not len(chosen):
-        return
-    wanted = set(chosen.tolist())
-    first, stop = int(chosen[0]), int(chosen[-1]) + 1
-    for t, frame in enumerate(read_frames(clip.path, start=first, stop=stop), start=first):
-        if t in wanted:
-            yield frame
 
 
 def _in_one_light(textures: F32, names: Sequence[str]) -> F32:

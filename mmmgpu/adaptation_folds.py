@@ -70,12 +70,13 @@ class Adapted:
 
     @property
     def path(self) -> NDArray[np.int64]:
-        """Numbers of the candidates that are the iterations of GDLR at the chosen rate, in order.
+        """Numbers of the candidates that are the iterations of the GDLR that was chosen, in order.
 
-        `training[path]` and `validation[path]` are its curves; with other methods, all candidates.
+        `training[path]` and `validation[path]` are its curves. Of other methods, the candidate
+        that was chosen.
         """
-        rate = self.constants.get("rate")
-        return np.flatnonzero([own.get("rate") == rate for own in self.candidates])
+        wanted = self.constants | {"iterations": None}
+        return np.flatnonzero([own | {"iterations": None} == wanted for own in self.candidates])
 
 
 @dataclass(frozen=True)
@@ -120,12 +121,12 @@ def _gdlr(models: PhonemeModels, class_of: Rows, part: _Part, descent: Descent) 
     rule = RULES[descent.rule]
     m, s = rule.units(models)
     mean, z = (models.mean - m) / s, (part.z - m) / s
-    steps = rule.steps(part.system, mean, class_of)
-    descend = partial(descend_means, part.system, mean, z, class_of)
+    descend = partial(descend_means, part.system, mean, z, class_of, iterations=descent.iterations)
     return [
-        ({"rule": descent.rule, "rate": rate, "iterations": i}, m + s * moved)
+        ({"rule": descent.rule, **constants, "rate": rate, "iterations": i}, m + s * moved)
+        for constants, metric in rule.metrics(part.system, mean, class_of)
         for rate in descent.rates or rule.rates
-        for i, moved in enumerate(descend(steps=rate * steps, iterations=descent.iterations))
+        for i, moved in enumerate(descend(metric=rate * metric))
     ]
 
 

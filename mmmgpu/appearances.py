@@ -120,10 +120,10 @@ def read_texture(mesh: Mesh, picture: F32, points: Floats, kernels: Backend) -> 
 def fit_light(texture: F32, mean: F32) -> Floats:
     """Gain and offset of each colour, (3, 2): those of least squares with
     ``texture ~ gain * mean + offset``, (P, 3) both."""
-    g, m = texture.astype(np.float64), mean.astype(np.float64)
-    dg, dm = g - g.mean(axis=0), m - m.mean(axis=0)
-    gain = (dg * dm).sum(axis=0) / np.maximum((dm**2).sum(axis=0), 1e-12)
-    return np.stack([gain, g.mean(axis=0) - gain * m.mean(axis=0)], axis=-1)
+    g, m = (np.array(colours.T, np.float64, order="C") for colours in (texture, mean))  # (3, P)
+    dm = m - m.mean(axis=1, keepdims=True)  # sums to 0: g need not be centred
+    gain = np.vecdot(g, dm) / np.maximum(np.vecdot(dm, dm), 1e-12)
+    return np.stack([gain, g.mean(axis=1) - gain * m.mean(axis=1)], axis=-1)
 
 
 def take_light_off(texture: F32, light: Floats) -> F32:

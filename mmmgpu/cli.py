@@ -22,10 +22,12 @@ from mmmgpu.commands import (
     reconstruct,
     speak,
     study,
+    track,
     train,
     transfer,
 )
 from mmmgpu.commands.endings import INTERRUPTED, guarded, prompt_interrupts
+from mmmgpu.errors import say_warnings
 
 app = typer.Typer(
     name="mmmgpu",
@@ -63,6 +65,7 @@ for _command, _example in (
     (demo.demo, demo.EXAMPLE),
     (align.align, align.EXAMPLE),
     (aam.aam, aam.EXAMPLE),
+    (track.track, track.EXAMPLE),
     (train.train, train.EXAMPLE),
     (reconstruct.reconstruct, reconstruct.EXAMPLE),
     (speak.speak, speak.EXAMPLE),
@@ -85,6 +88,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # any file name can be shown
     prompt_interrupts()
+    say_warnings()
     try:
         app()
     except SystemExit as end:

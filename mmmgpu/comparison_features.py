@@ -96,20 +96,26 @@ class SavedFeatures:
 
 @dataclass(frozen=True)
 class AamFeatures:
-    """Parameters of an active appearance model, 32 of them, from landmarks of every frame."""
+    """Parameters of an active appearance model, from landmarks of every frame.
+
+    options: keywords of `aam_training.fit_aam`, where they are not its defaults.
+    """
 
     landmarks: Path
     backend: str
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     def facts(self) -> dict[str, Any]:
-        """Names, sizes and times of the landmarks."""
-        return {"aam": _stats(self.landmarks), "backend": self.backend}
+        """Names, sizes and times of the landmarks, and the options."""
+        facts = {"aam": _stats(self.landmarks), "backend": self.backend}
+        return facts | {"options": dict(self.options)}
 
     def learn(self, clips: Sequence[Clip], folder: Path, fold: int) -> Eye:
         """An AAM of the clips."""
         from mmmgpu.aam import fit_aam
 
-        aam = fit_aam([clip.path for clip in clips], self.landmarks, backend=self.backend)
+        paths = [clip.path for clip in clips]
+        aam = fit_aam(paths, self.landmarks, backend=self.backend, **self.options)
         return _AamEye(aam, self.landmarks, self.backend)
 
 
@@ -186,7 +192,7 @@ def features_named(
         name: As on the command line.
         alignments: As `train` wants them.
         landmarks: Folder of landmarks; for aam.
-        options: For mmm: fields of `training.Options`.
+        options: For mmm: fields of `training.Options`; for aam: keywords of `fit_aam`.
         backend: A name for `mmmgpu.backends.get_backend`.
 
     Raises:
@@ -197,7 +203,7 @@ def features_named(
             raise InputError(
                 "--features aam needs the landmarks of the clips; give --landmarks DIR"
             )
-        return AamFeatures(landmarks, backend)
+        return AamFeatures(landmarks, backend, options)
     if name == "mmm":
         return MmmFeatures(alignments, backend, Options(**options))
     if not Path(name).is_dir():

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mmmgpu.comparison_scores import METRICS
+from mmmgpu.comparison_scores import METRICS, NOT_COMPARABLE
 from mmmgpu.files import atomic_path, write_json, write_text
 
 TITLES = {
@@ -26,7 +26,15 @@ SIZE = (11.0, 5.6)  # of the figure [inch]
 def table_rows(results: Mapping[str, Any]) -> Iterator[list[str]]:
     """One row a model: its name, and mean +- half width of the 95 % interval of each metric."""
     for model, found in results["models"].items():
-        yield [model, *(_said(found[metric]) for metric in METRICS)]
+        notes = [_note(results, model, metric) for metric in METRICS]
+        said = [note or _said(found[m]) for note, m in zip(notes, METRICS, strict=True)]
+        yield [model, *said]
+
+
+def _note(results: Mapping[str, Any], model: str, metric: str) -> str:
+    """What stands in place of a value that a model cannot have."""
+    is_missing = metric == "log_likelihood" and model in results["not_comparable"]
+    return NOT_COMPARABLE if is_missing else ""
 
 
 def _said(found: Mapping[str, Any] | None) -> str:
@@ -51,7 +59,8 @@ def pair_rows(results: Mapping[str, Any]) -> Iterator[list[str]]:
 def write_comparison(results: Mapping[str, Any], folder: Path) -> list[Path]:
     """Write ``compare.json``, ``compare.csv``, ``figure4.svg`` and ``figure4.png``.
 
-    The CSV has one row for each model, metric and fold, and one for the mean.
+    The CSV has one row for each model, metric and fold, and one for the mean; a note says where a
+    value is missing because it would not be comparable.
     """
     names = ("compare.json", "compare.csv", "figure4.svg", "figure4.png")
     paths = [folder / name for name in names]
@@ -65,13 +74,14 @@ def write_comparison(results: Mapping[str, Any], folder: Path) -> list[Path]:
 def _csv(results: Mapping[str, Any]) -> str:
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
-    out.writerow(["model", "metric", "fold", "value", "half_width_95"])
+    out.writerow(["model", "metric", "fold", "value", "half_width_95", "note"])
     for model, found in results["models"].items():
         for metric in METRICS:
+            note = _note(results, model, metric)
             for number, fold in enumerate(results["folds"], start=1):
-                out.writerow([model, metric, number, fold[model][metric], None])
+                out.writerow([model, metric, number, fold[model][metric], None, note])
             mean = found[metric] or {"mean": None, "half_width_95": None}
-            out.writerow([model, metric, "mean", mean["mean"], mean["half_width_95"]])
+            out.writerow([model, metric, "mean", mean["mean"], mean["half_width_95"], note])
     return text.getvalue()
 
 
@@ -91,6 +101,9 @@ def _draw(results: Mapping[str, Any], path: Path) -> None:
             axes.set_xticks(range(len(bars)), list(bars))
             axes.set_title(TITLES[metric], fontsize=9)
             axes.margins(x=0.15)
+            left_out = [m for m in results["models"] if _note(results, m, metric)]
+            if left_out:
+                axes.set_xlabel(f"{NOT_COMPARABLE}: {', '.join(left_out)}", fontsize=8)
         for axes in panels[len(METRICS) :]:
             axes.set_axis_off()
         with atomic_path(path) as temporary:

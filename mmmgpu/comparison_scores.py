@@ -15,7 +15,7 @@ Source: Englebienne, Cootes & Rattray (NIPS 2007), section 4.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -35,6 +35,20 @@ METRICS = (
     "variance_ratio",
     "smoothness",
 )
+
+NOT_COMPARABLE = "not comparable"  # in place of a log-likelihood
+WHY = "no distribution of the features; a likelihood would mean nothing beside the others'"
+
+
+def not_comparable(models: Sequence[str]) -> dict[str, str]:
+    """For each of the `models` without a log-likelihood, why it has none."""
+    return dict.fromkeys(models, f"log_likelihood is {NOT_COMPARABLE}: {WHY}")
+
+
+def legend(models: Iterable[str]) -> str:
+    """What is to be said of the `models` without a log-likelihood, beside a table or figure."""
+    names = ", ".join(models)
+    return f"log-likelihood {NOT_COMPARABLE}: {names} ({WHY})" if names else ""
 
 
 def score(made: Sequence[Floats], real: Sequence[Floats], log_likelihood: float | None) -> Scores:

@@ -88,9 +88,8 @@ def _place(
 def _over(frame: Picture, box: tuple[slice, slice], placed: F32, opacity: F32) -> Picture:
     result = frame.copy()
     share = opacity[..., None]
-    mixed = share * (placed * 255 - frame[box]) + frame[box]
-    seen = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
-    np.copyto(result[box], seen, where=share > 0)
+    mixed = share * (placed * 255 - frame[box]) + frame[box]  # the frame itself, where share is 0
+    result[box] = np.clip(np.rint(mixed), 0, 255)
     return result
 
 

@@ -25,7 +25,7 @@ from mmmgpu.checkpoints import (
     write_step,
 )
 from mmmgpu.corpora import Clip
-from mmmgpu.dynamics import MODELS, Dynamics
+from mmmgpu.dynamics import FIVE, MODELS, Dynamics
 from mmmgpu.errors import InputError
 from mmmgpu.models import REGULARISED, Calm, Model
 from mmmgpu.parallel import one_thread_each
@@ -269,8 +269,8 @@ def utterances_of(frames: Frames, coordinates: Sequence[Floats]) -> list[Utteran
 def fit_dynamics(
     alpha: Sequence[Utterance], beta: Sequence[Utterance]
 ) -> dict[str, tuple[Dynamics, Dynamics]]:
-    """Of each stream, the models of movement other than `REGULARISED`, which is fitted apart."""
-    names = [name for name in MODELS if name != REGULARISED]
+    """Of each stream, the `FIVE` models of movement but `REGULARISED`, which is fitted apart."""
+    names = [name for name in FIVE if name != REGULARISED]
     with progress_bar(2 * len(names), "fit other movements") as advance:
 
         def fit(name: str, utterances: Sequence[Utterance]) -> Dynamics:

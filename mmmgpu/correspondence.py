@@ -3,9 +3,13 @@
     S(p) = A [1, x, y]' + sum_k w_k phi(|p - a_k|),     phi(r) = exp(-gamma r^2),
 
 with the side conditions sum_k w_k = 0 and sum_k w_k a_k' = 0, so that an affine map of the points
-has no weights, and S(a_k) = b_k exactly. `c` says how narrow the Gaussians are in units of the
-points' own spacing: gamma = c / spacing^2. Solved densely in float64: there are a few dozen points.
-`mmmgpu.operations.evaluate_rbf` is the same map on a device.
+has no weights, and S(a_k) = b_k exactly. With `smoothing` lambda > 0 in the equations,
+
+    S(a_k) + lambda w_k = b_k:
+
+the bending of S is weighed against its errors at the points (Wahba 1990). `c` says how narrow the
+Gaussians are in units of the points' own spacing: gamma = c / spacing^2. Solved densely in float64:
+there are a few dozen points. `mmmgpu.operations.evaluate_rbf` is the same map on a device.
 
 Sources: CE05 = Chang & Ezzat, "Transferable Videorealistic Speech Animation" (SCA 2005), section
 4.1; side conditions: Wendland, "Scattered Data Approximation" (2005), chapter 8.
@@ -20,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from mmmgpu.errors import InputError
 
 DEFAULT_C = 2.0  # see docs/model.md for how it was chosen
+MOST_SMOOTHING = 100.0  # S is as good as affine there
 LARGEST_CONDITION = 1e6  # beyond it the map swings between the points, and float32 loses it
 SAME_PLACE = 0.01  # [px] points closer than this are one point
 FLAT = 0.01  # width over length of points on one line
@@ -130,7 +135,11 @@ class Correspondence:
 
 
 def rbf_correspondence(
-    points_a: ArrayLike, points_b: ArrayLike, *, c: float | None = None
+    points_a: ArrayLike,
+    points_b: ArrayLike,
+    *,
+    c: float | None = None,
+    smoothing: float = 0.0,
 ) -> Correspondence:
     """The correspondence that carries each marked point of A to its partner in B (CE05, Eq. 6).
 
@@ -139,11 +148,12 @@ def rbf_correspondence(
         points_b: Their partners in picture B, shape (N, 2).
         c: Sharpness of the Gaussians, phi(r) = exp(-c (r / spacing)^2), with spacing the mean
             distance of a point of A to its nearest other one. None is `DEFAULT_C`.
+        smoothing: lambda, in units of phi(0) = 1: 0 is exact, 100 nearly affine.
 
     Raises:
         InputError: Not two equally long lists of at least three finite points, points on one line
-            or at the same place, c not positive, or c so small (below about 1/4) that the system
-            is ill-conditioned.
+            or at the same place, c or smoothing out of range, or c so small (below about 1/4)
+            that the system is ill-conditioned.
     """
     a, b = _points("points_a", points_a), _points("points_b", points_b)
     if len(a) != len(b):
@@ -155,7 +165,9 @@ def rbf_correspondence(
     sharp = DEFAULT_C if c is None else float(c)
     if not (np.isfinite(sharp) and sharp > 0):
         raise InputError(f"c must be a finite number above 0, got {c}; leave it out for the usual")
-    weights, affine = _fit(a, b, sharp, spacing)
+    if not 0 <= smoothing <= MOST_SMOOTHING:
+        raise InputError(f"smoothing must be between 0 and {MOST_SMOOTHING:g}, got {smoothing}")
+    weights, affine = _fit(a, b, sharp, spacing, smoothing)
     return Correspondence(a, weights, affine, sharp, spacing)
 
 
@@ -197,7 +209,7 @@ def _check_places(name: str, p: Array) -> Array:
     return distances
 
 
-def _fit(a: Array, b: Array, c: float, spacing: float) -> tuple[Array, Array]:
+def _fit(a: Array, b: Array, c: float, spacing: float, smoothing: float) -> tuple[Array, Array]:
     """Weights (N, 2) and affine part (2, 3) of the map a -> b (N, 2).
 
     The points are centred and scaled for the polynomial part: its columns are then of the size of
@@ -205,7 +217,7 @@ def _fit(a: Array, b: Array, c: float, spacing: float) -> tuple[Array, Array]:
     """
     number = len(a)
     origin, scale = a.mean(axis=0), np.abs(a - a.mean(axis=0)).max()
-    phi = np.exp(-c * (_length(a[:, None] - a) / spacing) ** 2)
+    phi = np.exp(-c * (_length(a[:, None] - a) / spacing) ** 2) + smoothing * np.eye(number)
     linear = np.column_stack([np.ones(number), (a - origin) / scale])
     system = np.block([[phi, linear], [linear.T, np.zeros((3, 3))]])
     condition = float(np.linalg.cond(system))

@@ -15,6 +15,7 @@ Source: Englebienne, Cootes & Rattray (NIPS 2007), section 3 and Appendix A.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mmmgpu.dpds_equations import Parameters, profile, trajectories
+from mmmgpu.errors import UnsettledWarning
 from mmmgpu.flat_records import tensor
 from mmmgpu.labelled import (
     LARGEST_A,
@@ -43,7 +45,10 @@ from mmmgpu.phonemes import positive
 
 NOISE_FLOOR = 1e-6  # of the variance of all frames: the least that R may be
 FIRST_A = 0.7  # where the descent starts
-TOLERANCE = 2e-6  # the descent ends where an iteration gains less, as a share of the objective
+SPAN = 10  # iterations: one may gain little, and the next one much
+TOLERANCE = 1e-4  # the descent ends where a span gains less [nats a frame and dimension]
+MEMORY = 30  # steps that L-BFGS learns the curvature from: all dimensions share them
+NO_OTHER_END = {"ftol": 0.0, "gtol": 0.0}  # or where nothing at all is gained
 BATCH_FRAMES = 50_000
 
 
@@ -68,7 +73,7 @@ class Dpds:
     @classmethod
     def fit(cls, sequences: Sequence[ArrayLike], labels: Sequence[Sequence[str]]) -> Dpds:
         """Maximum likelihood; arguments and errors are those of `labelled.check_labelled`."""
-        return descend(check_labelled(sequences, labels))
+        return descend(check_labelled(sequences, labels))[0]
 
     def generate(self, labels: Iterable[str]) -> Iterator[Floats]:
         """The frame x_t (d,) for each label, as they come."""
@@ -86,35 +91,51 @@ class Dpds:
         return log_normal(y - np.array(list(self.generate(labels))), self.R)
 
 
-def descend(data: Labelled, *, iterations: int = 100) -> Dpds:
+def descend(data: Labelled, *, iterations: int = 1000) -> tuple[Dpds, list[float]]:
     """Fit a DPDS: L-BFGS over A, with mu and nu exact at each step.
 
     Args:
         data: What to fit.
-        iterations: Of L-BFGS, at most.
+        iterations: Of L-BFGS, at most; an `UnsettledWarning` says that they were too few.
+
+    Returns:
+        The model, and -log p(y) [nats a frame and dimension] at the best R, up to a constant, at
+        the start and after each iteration.
     """
-    from scipy.optimize import minimize
+    from scipy.optimize import OptimizeResult, minimize
 
     P, d, n = len(data.labels), data.y[0].shape[1], len(data.frames)
     parts = batches(data, frames=BATCH_FRAMES)
     variance = positive(data.frames.var(axis=0))
 
     def objective(flat: Floats) -> tuple[float, Floats]:
-        """-log p(y) / N [nats a frame] at the best R for this A, up to a constant."""
         error, slope, _ = profile(flat.reshape(P, d), parts)
-        share = error / (n * variance) + NOISE_FLOOR  # without unit, as `TOLERANCE` should be
-        return float(0.5 * np.log(share).sum()), (0.5 / (n * variance) * slope / share).ravel()
+        share = error / (n * variance) + NOISE_FLOOR  # without unit, as A is
+        return float(0.5 * np.log(share).mean()), (0.5 / (n * d * variance) * slope / share).ravel()
+
+    start = np.full(P * d, FIRST_A)
+    history = [objective(start)[0]]
+
+    def settle(intermediate_result: OptimizeResult) -> None:
+        history.append(float(intermediate_result.fun))
+        if len(history) > SPAN and history[-1 - SPAN] - history[-1] < TOLERANCE:
+            raise StopIteration
 
     found = minimize(
         objective,
-        np.full(P * d, FIRST_A),
+        start,
         jac=True,
         method="L-BFGS-B",
         bounds=[(-LARGEST_A, LARGEST_A)] * (P * d),
-        options={"maxiter": iterations, "ftol": TOLERANCE},
+        callback=settle,
+        options={"maxiter": iterations, "maxfun": 20 * iterations, "maxcor": MEMORY} | NO_OTHER_END,
     )
+    if found.nit >= iterations:
+        warnings.warn(
+            UnsettledWarning(f"dpds: still gaining after {iterations} iterations"), stacklevel=2
+        )
     A = found.x.reshape(P, d)
-    return _completed(data, profile(A, parts)[2], parts, NOISE_FLOOR * variance)
+    return _completed(data, profile(A, parts)[2], parts, NOISE_FLOOR * variance), history
 
 
 def _completed(data: Labelled, best: Parameters, parts: Sequence[Batch], floor: Floats) -> Dpds:

@@ -6,6 +6,8 @@
     dpds   `mmmgpu.dpds`         the same without process noise
     egp02  `mmmgpu.regularised`  regularised trajectories
 
+and, much slower, slds-full: slds with matrices in place of diagonals.
+
 All are fitted to sequences (T_s, d) with one label a frame: AAM parameters, alpha or beta alike.
 What they are, what they do with labels they have not seen, and what was measured: docs/dynamics.md.
 
@@ -29,7 +31,7 @@ from mmmgpu.flat_records import record_of, tensors_of
 from mmmgpu.hmm_mean import HmmMean
 from mmmgpu.labelled import Floats
 from mmmgpu.regularised import Regularised
-from mmmgpu.slds import Slds
+from mmmgpu.slds import FullSlds, Slds
 from mmmgpu.tensor_files import Facts, FileKind, Tensors, read_tensors, write_tensors
 
 KIND = FileKind("mmmgpu-dynamics", 1, "model of movement", "save_dynamics", "fit the model again")
@@ -87,7 +89,9 @@ MODELS: dict[str, type[Dynamics]] = {
     "slds": Slds,
     "dpds": Dpds,
     "egp02": Regularised,
+    "slds-full": FullSlds,
 }
+FIVE = ("hmm", "brand", "slds", "dpds", "egp02")  # what is fitted where nothing else is asked for
 
 
 def trajectory(model: Dynamics, labels: Sequence[str]) -> Floats:

@@ -14,27 +14,29 @@ Eq. 16 solves a system for every entry of R_g; the adjoint gives them all by one
 `trajectories.System`), and as Sigma does not move, A is factored once for all iterations.
 
 The paper's eta is one small number, which suits neither the length of the corpus nor the scale of
-the coordinates. Were y as free as mu, E would curve along R_g by up to
+the coordinates. Were y as free as mu, E would curve along row j of R_g by
 
-    L_g = 2 lambda_max(sum over t in g of xi_t xi_t'),
+    H_g = 2 sum over t in g of xi_t xi_t',
 
-and eta_g = eta'/L_g with eta' in (0, 1] never ascends. But y is not: where phones of small and
-large variance meet, smoothing passes more on than it gets, and E curves by up to c_j L_g in
-dimension j. So the step is eta'/(max(c_j, 1) L_g), with c_j from a few power iterations.
+and R_gj <- R_gj - eta' H_g^-1 dE/dR_gj with eta' in (0, 1] never ascends (eta'/L_g with L_g the
+largest eigenvalue would not either, but hardly moves along the smaller ones). xi has at most as
+many values as the class has phones, so H_g is damped by 2 r I, as if by r frames more; and one may
+hold all of R_g but the bias and the diagonal, as in MLLR. But y is not free: where phones of small
+and large variance meet, smoothing passes more on than it gets, and E curves by up to c_j H_g in
+dimension j. So the step is eta' H_g^-1 / max(c_j, 1), with c_j from a few power iterations.
 
-xi mixes the pure number 1 with coordinates of some scale: where they are small against 1, descent
-moves the bias and hardly anything else. With these steps the coordinates are measured in the
-stream's own units, (mu - m)/s (`standard_units`), in which Eq. 15 is the same.
+xi mixes the pure number 1 with coordinates of some scale. With these steps the coordinates are
+measured in the stream's own units, (mu - m)/s (`standard_units`), in which Eq. 15 is the same.
 
 Source: CE05 = Chang & Ezzat, "Transferable Videorealistic Speech Animation" (SCA 2005), 5.3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,19 +50,26 @@ Rows = NDArray[np.int64]
 
 POWER_ITERATIONS = 10  # find c_j to a quarter; descent would bear half
 DIVERGED = 1e100  # [model coordinates] no mean is that large
+SHAPES: Final = ("diagonal", "full")  # what is free in R_g
+DAMPINGS: Final = (1.0, 10.0)  # r, in frames
+
+Metric = tuple[dict[str, Any], Array]  # constants as JSON values, (G, d, d + 1, d + 1)
 
 
-def bounded_steps(system: System, mean: Array, class_of: Rows) -> Array:
-    """1 / (max(c_j, 1) L_g), shape (G, d); 0 for a class without frames, which stays."""
-    L = class_curvature(system.line.phone, mean, class_of)
-    inverse = np.where(L > 0, 1 / np.where(L > 0, L, 1), 0)
-    c = np.broadcast_to(gain(system, mean, class_of, inverse), mean.shape[1])
-    return np.asarray(inverse[:, None] / np.maximum(c, 1))
+def bounded_metrics(system: System, mean: Array, class_of: Rows) -> Iterator[Metric]:
+    """H_g^-1 / max(c_j, 1), for either shape and damping; 0 for a class without frames."""
+    for shape in SHAPES:
+        for damping in DAMPINGS:
+            roots = curvature_roots(system.line.phone, mean, class_of, shape=shape, damping=damping)
+            c = np.broadcast_to(gain(system, mean, class_of, roots), mean.shape[1])
+            metric = roots @ roots / np.maximum(c, 1)[:, None, None]
+            yield {"shape": shape, "damping": damping}, metric
 
 
-def paper_steps(_: System, mean: Array, class_of: Rows) -> Array:
-    """1 everywhere: eta is the rate, as in Eq. 17; shape (G, d)."""
-    return np.ones((class_of.max() + 1, mean.shape[1]))
+def paper_metrics(_: System, mean: Array, class_of: Rows) -> Iterator[Metric]:
+    """I: eta is the rate, as in Eq. 17."""
+    size = class_of.max() + 1, mean.shape[1]
+    yield {}, np.broadcast_to(np.eye(size[1] + 1), (*size, size[1] + 1, size[1] + 1))
 
 
 def standard_units(models: PhonemeModels) -> tuple[Array, float]:
@@ -76,24 +85,24 @@ def paper_units(models: PhonemeModels) -> tuple[Array, float]:
 
 @dataclass(frozen=True)
 class Rule:
-    """How steps are taken.
+    """How steps are taken: R_gj <- R_gj - rate metric_gj dE/dR_gj.
 
     Attributes:
-        steps: of each class and dimension, (G, d), before the rate; given a system, the means in
-            these units, (P, d), and the class of each phone.
+        metrics: to choose from, before the rate; given a system, the means in these units, (P, d),
+            and the class of each phone.
         units: (m, s) of the coordinates (mu - m)/s that are descended in.
         rates: to choose from where none are given.
     """
 
-    steps: Callable[[System, Array, Rows], Array]
+    metrics: Callable[[System, Array, Rows], Iterator[Metric]]
     units: Callable[[PhonemeModels], tuple[Array, float]]
     rates: tuple[float, ...]
 
 
 RULES: Final = MappingProxyType(
     {
-        "bounded": Rule(bounded_steps, standard_units, (0.1, 0.3, 1.0)),
-        "paper": Rule(paper_steps, paper_units, (0.005,)),
+        "bounded": Rule(bounded_metrics, standard_units, (0.3,)),
+        "paper": Rule(paper_metrics, paper_units, (0.005,)),
     }
 )
 
@@ -103,7 +112,7 @@ class Descent:
     """What GDLR may try.
 
     Attributes:
-        rule: "bounded": steps by the curvature. "paper": one eta for all.
+        rule: "bounded": steps by the curvature of each class. "paper": one eta for all.
         rates: eta' in (0, 1], or the paper's eta > 0, to choose from. Empty: those of the rule.
         iterations: The most to take.
     """
@@ -129,7 +138,7 @@ DESCENT: Final = Descent()
 
 
 def descend_means(
-    system: System, mean: Array, z: Array, class_of: Rows, *, steps: Array, iterations: int = 30
+    system: System, mean: Array, z: Array, class_of: Rows, *, metric: Array, iterations: int = 30
 ) -> Array:
     """Eq. 17 from R_g = [0 | I]: the adapted means after each iteration.
 
@@ -138,17 +147,18 @@ def descend_means(
         mean: mu_p before, shape (P, d).
         z: Real trajectories, shape (N, d).
         class_of: Class of each phone, shape (P,).
-        steps: eta of each class and dimension, shape (G, d): a rate times those of a rule.
+        metric: What takes a slope to a step, of each class and dimension, shape
+            (G, d, d + 1, d + 1): a rate times that of a rule.
         iterations: The most to take.
 
     Returns:
         Means, shape (iterations + 1, P, d), the first those before. Fewer where the descent
         diverged.
     """
-    R = identity_regressions(len(steps), mean.shape[1])
+    R = identity_regressions(len(metric), mean.shape[1])
     path = [mean]
     for _ in range(iterations):
-        R = R - steps[:, :, None] * error_and_slope(system, R, mean, z, class_of)[1]
+        R = R - _applied(metric, error_and_slope(system, R, mean, z, class_of)[1])
         moved = regressed(R, mean, class_of)
         if np.abs(moved).max() > DIVERGED:
             break
@@ -181,40 +191,65 @@ def error_and_slope(
     return E, slope
 
 
-def class_curvature(phone: Rows, mean: Array, class_of: Rows) -> Array:
-    """L_g = 2 lambda_max(sum over t in g of xi_t xi_t'), shape (G,); 0 for a class without frames.
+def curvature_roots(
+    phone: Rows, mean: Array, class_of: Rows, *, shape: str, damping: float
+) -> Array:
+    """H_g^-1/2 of each class, for each dimension, shape (G, d, d + 1, d + 1).
+
+    0 for a class without frames, and for what is not free: with the shape "diagonal", row j of R_g
+    but its bias and entry j.
 
     Args:
         phone: Row of the phone of each frame, shape (N,).
         mean: mu_p, shape (P, d).
         class_of: Class of each phone, shape (P,).
+        shape: One of `SHAPES`.
+        damping: r [frames].
     """
+    d = mean.shape[1]
     frames = np.bincount(phone, minlength=len(mean))
     xi = extended(mean) * np.sqrt(frames)[:, None]
-    return np.array(
-        [2 * np.linalg.norm(xi[class_of == g], ord=2) ** 2 for g in range(class_of.max() + 1)]
-    )
+    roots = np.zeros((class_of.max() + 1, d, d + 1, d + 1))
+    for g in np.unique(class_of[frames > 0]):
+        H = 2 * (xi[class_of == g].T @ xi[class_of == g] + damping * np.eye(d + 1))
+        if shape == "full":
+            roots[g] = _inverse_root(H)
+            continue
+        free = np.stack([np.zeros(d, np.int64), np.arange(1, d + 1)], axis=1)  # (d, 2)
+        entries = np.arange(d)[:, None, None], free[:, :, None], free[:, None, :]
+        roots[g][entries] = _inverse_root(H[entries[1:]])
+    return roots
 
 
-def gain(system: System, mean: Array, class_of: Rows, inverse: Array) -> Array:
-    """c_j: how many times L_g E curves at most, all classes together, by power iteration.
+def _inverse_root(H: Array) -> Array:
+    """H^-1/2 of positive definite matrices, (..., n, n)."""
+    value, vector = np.linalg.eigh(H)
+    return np.asarray(vector / np.sqrt(value)[..., None, :] @ np.swapaxes(vector, -1, -2))
 
-    The Hessian H of E in the rows j of all R_g, taken in units in which each L_g is 1. Full
+
+def _applied(metric: Array, slope: Array) -> Array:
+    """Each row of each class by its own matrix: (G, d, n, n), (G, d, n) -> (G, d, n)."""
+    return np.asarray((metric @ slope[..., None])[..., 0])
+
+
+def gain(system: System, mean: Array, class_of: Rows, roots: Array) -> Array:
+    """c_j: how many times H_g E curves at most, all classes together, by power iteration.
+
+    The Hessian of E in the rows j of all R_g, taken in units in which each H_g is I. Full
     covariances couple the dimensions: one c for all.
 
     Args:
         system, mean, class_of: As in `descend_means`.
-        inverse: 1/L_g, shape (G,).
+        roots: H_g^-1/2, shape (G, d, d + 1, d + 1).
 
     Returns:
         c_j, shape (d,), or (1,) of full models.
     """
-    unit = np.sqrt(inverse)[:, None, None]
     of_dimension = (0, 2) if system.precision.ndim == 2 else (0, 1, 2)
     at_rest = np.zeros((len(system.line.phone), mean.shape[1]))
-    shape = len(inverse), mean.shape[1], mean.shape[1] + 1
-    V = np.random.default_rng(0).normal(size=shape)
+    V = np.random.default_rng(0).normal(size=roots.shape[:3])
     for _ in range(POWER_ITERATIONS):
         V /= np.sqrt(np.sum(V**2, axis=of_dimension, keepdims=True))
-        V = unit * error_and_slope(system, unit * V, mean, at_rest, class_of)[1]  # H V
+        moved = _applied(roots, V)
+        V = _applied(roots, error_and_slope(system, moved, mean, at_rest, class_of)[1])
     return np.asarray(np.sqrt(np.sum(V**2, axis=of_dimension, keepdims=True)).reshape(-1))

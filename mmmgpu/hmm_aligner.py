@@ -22,12 +22,14 @@ from mmmgpu.hmm_training import BREATH_STATES, STATES, Utterance, flat_start, tr
 from mmmgpu.lexicons import Spoken
 from mmmgpu.mfcc import SHIFT, mfcc
 from mmmgpu.parallel import one_thread_each
-from mmmgpu.phone_hmms import PhoneHmms, log_densities, viterbi
+from mmmgpu.phone_hmms import PhoneHmms, log_components, log_densities, viterbi
 from mmmgpu.phone_networks import BREATH, PAUSE, Network, unroll
 from mmmgpu.phones import SIL
 from mmmgpu.sounds import checked_speech
 
 LARGEST: Final = 20_000_000  # frames times states of one clip; each takes some 50 bytes
+OUTLIER: Final = 6.0  # robust deviations above the median: a misfit that is to be looked at
+FEWEST_CLIPS: Final = 8  # with fewer nothing can be said of what is usual
 _STEP: Final = "training"  # of the checkpoints
 
 
@@ -137,6 +139,41 @@ def align(hmms: PhoneHmms, recording: Recording) -> Alignment:
         Segment(recording.words[w][0], times[a], times[b]) for w, a, b in _runs(word) if w != PAUSE
     ]
     return Alignment(cover(phones, recording.duration), tuple(words), recording.duration)
+
+
+def misfit(hmms: PhoneHmms, recording: Recording, alignment: Alignment) -> float:
+    """How much better another phone explains a frame than the one it is aligned with [nats].
+
+    The mean over all frames that are not silent; 0 if each is explained best by its own. Wrong
+    words are forced on the sound and fit it badly; the likelihood alone would not tell, for it
+    depends on the clip's noise more than on its words.
+    """
+    with one_thread_each():
+        every = np.arange(len(hmms.means))
+        log_b = np.logaddexp.reduce(log_components(hmms, every, recording.features), axis=2)
+    best = np.stack([log_b[:, list(states)].max(axis=1) for states in hmms.states.values()], axis=1)
+    times = (np.arange(len(best)) + 0.5) * SHIFT
+    ends = [phone.end for phone in alignment.phones[:-1]]
+    said = np.searchsorted(ends, times, side="right")
+    rows = {label: row for row, label in enumerate(hmms.states)}
+    own = np.array([rows[phone.label] for phone in alignment.phones])[said]
+    speech = own != rows[SIL]
+    gaps = best.max(axis=1) - best[np.arange(len(best)), own]
+    return float(gaps[speech].mean()) if speech.any() else 0.0
+
+
+def suspects(misfits: ArrayLike) -> NDArray[np.bool_]:
+    """Which clips fit their transcripts far worse than the others do, by their misfits (N,).
+
+    More than `OUTLIER` deviations above the median, the deviation taken from the median of
+    absolute differences; none of fewer than `FEWEST_CLIPS`.
+    """
+    values = np.asarray(misfits, np.float64)
+    if len(values) < FEWEST_CLIPS:
+        return np.zeros(len(values), bool)
+    above = values - np.median(values)
+    deviation = 1.4826 * np.median(np.abs(above))  # that of a normal distribution
+    return np.asarray(above > OUTLIER * deviation)
 
 
 def _network(hmms: PhoneHmms, recording: Recording) -> Network:

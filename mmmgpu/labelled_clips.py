@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.corpora import check_names
 from mmmgpu.errors import InputError
-from mmmgpu.landmarks import read_landmarks
+from mmmgpu.landmarks import read_points
 from mmmgpu.marking import LANDMARK_ROWS
 from mmmgpu.videos import VideoInfo, probe
 
@@ -90,16 +90,17 @@ def read_labelled_clip(clip: Path, folder: Path, rows: Rows | None) -> LabelledC
     by_hand = folder / f"{clip.stem}.json"
     if by_hand.is_file() and not by_hand.with_suffix(".npz").is_file():
         frames, points = _read_json(by_hand, info.frames)
-        source = by_hand
+        source, given = by_hand, None
     else:
-        points = read_landmarks(folder, clip, info.frames, least=least)
+        points, given = read_points(folder, clip, info.frames, least=least)
         frames, source = np.arange(len(points)), folder / f"{clip.stem}.npz"
-    if points.shape[1] < least:
+    given = given or tuple(range(points.shape[1]))
+    if points.shape[1] < FEWEST or not set(rows or ()) <= set(given):
         raise InputError(
             f"{source}: has {points.shape[1]} landmarks a frame, {least} are needed; "
             "to use all that there are give --all-points"
         )
-    chosen = points if rows is None else points[:, list(rows)]
+    chosen = points if rows is None else points[:, [given.index(row) for row in rows]]
     _check(source, frames, chosen, info)
     return LabelledClip(clip, info, frames, chosen)
 

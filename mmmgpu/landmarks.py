@@ -41,14 +41,30 @@ def read_landmarks(
     least: how many landmarks a frame must have, n; by default those of the lips.
 
     Raises:
-        InputError: There are none, or not for so many frames, or some are not finite.
+        InputError: There are none, or not for so many frames, or some are not finite; or the file
+            holds a choice of a tracker's, as `mmmgpu track` writes them.
     """
+    points, rows = read_points(folder, clip, frames, least=least)
+    if rows is not None:
+        raise InputError(
+            f"{folder / clip.stem}.npz: holds {len(rows)} landmarks chosen for an appearance "
+            "model; give a face tracker's"
+        )
+    return points
+
+
+def read_points(
+    folder: Path, clip: Path, frames: int | None, *, least: int
+) -> tuple[Floats, tuple[int, ...] | None]:
+    """As `read_landmarks`, and which of a tracker's landmarks the points are; None: all of them."""
     path = folder / f"{clip.stem}.npz"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             points = np.asarray(arrays["points"])
+            rows = tuple(np.asarray(arrays["rows"], np.int64)) if "rows" in arrays else None
     except _UNREADABLE as e:
         raise InputError(f"{path}: no landmarks of {clip} ({e}); give --landmarks DIR") from e
+    least = least if rows is None else len(rows)
     wanted = (len(points) if frames is None and points.ndim else frames, 2)
     if points.ndim != 3 or (len(points), points.shape[2]) != wanted or points.shape[1] < least:
         raise InputError(
@@ -57,7 +73,9 @@ def read_landmarks(
         )
     if points.dtype.kind not in "fiu" or not np.isfinite(points).all():
         raise InputError(f"{path}: must hold finite numbers; leave the clip out")
-    return points.astype(np.float64)
+    if rows is not None and points.shape[1] != len(set(rows)):
+        raise InputError(f"{path}: must have one of the 'rows' for each point; track it again")
+    return points.astype(np.float64), rows
 
 
 def moved_landmarks(basis: Basis, alpha: Floats, points: Floats) -> Floats:

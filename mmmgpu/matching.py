@@ -1,14 +1,9 @@
 """Matching by synthesis: which frames of a new person show what a model's prototypes show.
 
-A is the person with a model, B the new one; S carries A's reference to B's (`correspondence`).
-Frames are first chosen by flow (CE05, Eq. 7),
-
-    P_k* = argmin_n  sum_p w_f(p) |C_syn,k(S(p)) - C_n(S(p))|
-    C_syn,k(S(p)) = S(p + C_k(p)) - S(p),
-
-then by flow and texture together. Prototype k of A is beta_k of the other prototypes of A, warped
-to it (Eq. 8); the same beta_k of B's candidates, warped along C_syn,k, is what B should look like
-(Eq. 9), and is compared with every frame (Eq. 10),
+A is the person with a model, B the new one. Frames are first chosen by flow (`flow_matching`), then
+by flow and texture together. Prototype k of A is beta_k of the other prototypes of A, warped to it
+(CE05, Eq. 8); the same beta_k of B's candidates, warped along the flow that prototype k has in B's
+face, is what B should look like (Eq. 9), and is compared with every frame (Eq. 10),
 
     P_k** = argmin_n  sum_p w_t(p) |I_syn,k(p) - I_n(p)|.
 
@@ -17,21 +12,19 @@ Both pictures of Eq. 10 are smoothed first: flows are good to a fraction of a pi
 edges of teeth and lips are sharper than that, they would count as different textures.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.analysis import solve_simplex
-from mmmgpu.backends import default_threads, get_backend
-from mmmgpu.basis import LIP, MOUTH, Basis
-from mmmgpu.correspondence import Correspondence
-from mmmgpu.flows import explanation_error
-from mmmgpu.parallel import map_ordered
-from mmmgpu.synthesis import NO_TEXTURE, warp_prototypes
+from mmmgpu.backends import get_backend
+from mmmgpu.backends.planes import picture, planes
+from mmmgpu.basis import MOUTH, Basis
+from mmmgpu.flow_matching import FlowScan, View, nearest_view, synthetic_flows
+from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -43,26 +36,11 @@ SMOOTHED = 0.02  # of the mouth's width: deviation of the Gaussian that smooths 
 
 
 @dataclass(frozen=True)
-class View:
-    """A pair of reference frames, and all flows relative to them, on the pixels of their regions.
-
-    reference_a: The prototype that is A's frame of the pair.
-    correspondence: S, from A's region to B's.
-    flows_a: of A's prototypes, (M, h, w, 2) [px].
-    flows_b: of B's frames, (N, h', w', 2) [px].
-    """
-
-    reference_a: int
-    correspondence: Correspondence
-    flows_a: F32
-    flows_b: F32
-
-
-@dataclass(frozen=True)
 class Matching:
     """Which frames were candidates on the way, and why.
 
     chosen: The frame of B for each prototype, (M,).
+    flow_history: Candidates of flow matching: by C_syn, then after each calibration, (J + 1, M).
     history: Candidates after flow matching and after each iteration, (I + 1, M).
     flow_distance, texture_distance: Of those candidates, each over its median, (I + 1, M); the
         first texture distances are those of the first iteration.
@@ -72,6 +50,7 @@ class Matching:
     """
 
     chosen: Numbers
+    flow_history: Numbers
     history: Numbers
     flow_distance: Floats
     texture_distance: Floats
@@ -99,47 +78,74 @@ def match_prototypes(
         views: Reference pairs; every prototype uses the one whose reference it is nearer to.
         fixed: Pairs (prototype, frame) that are known.
         balance: t in [0, 1]: 1 is Eq. 7 alone, 0 is Eq. 10 alone.
-        iterations: At most so many.
+        iterations: At most so many, of flow matching and of both together.
         backend: A name for `mmmgpu.backends.get_backend`.
     """
     view = nearest_view(source, views)
-    flow = flow_distances(source, views, view, backend=backend)
-    flow = flow / _median(flow)
-    beta = texture_coordinates(source, views, view, backend=backend)
-    scan = _TextureScan(target, views, view, beta, backend)
+    rows = np.arange(len(view))
 
-    def choose(cost: Floats) -> Numbers:
-        chosen = cost.argmin(axis=1)
+    def choose(cost: Floats) -> tuple[Numbers, float]:
+        chosen = cost.argmin(axis=1).astype(np.int64)
         for k, n in fixed:
             chosen[k] = n
-        return np.asarray(chosen, np.int64)
+        return chosen, float(cost[rows, chosen].sum())
 
-    rows, history = np.arange(len(flow)), [choose(flow)]
-    texture = scan(history[0])
-    scale, outcome = _median(texture), "limit"
-    costs: list[float] = []
-    apart = [(flow[rows, history[0]], texture[rows, history[0]] / scale)]
-    while len(costs) < iterations and outcome == "limit":
-        texture = scan(history[-1]) / scale if costs else texture / scale
-        cost = balance * flow + (1 - balance) * texture
-        new = choose(cost)
-        costs.append(float(cost[rows, new].sum()))
-        apart.append((flow[rows, new], texture[rows, new]))
-        seen = [i for i, old in enumerate(history) if np.array_equal(old, new)]
-        history.append(new)
-        if seen:
-            outcome = "fixed point" if seen[-1] == len(history) - 2 else "cycle"
-    first = seen[-1] if outcome == "cycle" else len(costs) - 1
-    best = first + 1 + int(np.argmin(costs[first:]))
+    flow_scan = FlowScan(source, views, view, backend=backend)
+    flow_history, start, _ = settle(
+        lambda chosen: choose(flow_scan(flow_scan.calibrate(chosen))),
+        choose(flow_scan())[0],
+        iterations,
+    )
+    calibration = flow_scan.calibrate(start)
+    flow = flow_scan(calibration)
+    flow = flow / _median(flow)
+
+    beta = texture_coordinates(source, views, view, backend=backend)
+    flows = synthetic_flows(views, view, target.w_t.shape, calibration)
+    texture_scan = _TextureScan(target, views, view, flows, beta, backend)
+    texture = texture_scan(start)
+    unit = _median(texture)
+    apart = [texture[rows, start] / unit]
+
+    def by_both(chosen: Numbers) -> tuple[Numbers, float]:
+        texture = texture_scan(chosen) / unit
+        new, cost = choose(balance * flow + (1 - balance) * texture)
+        apart.append(texture[rows, new])
+        return new, cost
+
+    history, chosen, outcome = settle(by_both, start, iterations)
     return Matching(
-        chosen=history[best],
-        history=np.array(history),
-        flow_distance=np.array([f for f, _ in apart]),
-        texture_distance=np.array([t for _, t in apart]),
+        chosen=chosen,
+        flow_history=flow_history,
+        history=history,
+        flow_distance=flow[rows, history],
+        texture_distance=np.array(apart),
         view=view,
         texture=beta,
         outcome=outcome,
     )
+
+
+def settle(
+    step: Callable[[Numbers], tuple[Numbers, float]], start: Numbers, iterations: int
+) -> tuple[Numbers, Numbers, str]:
+    """Repeat `chosen, cost = step(chosen)` until candidates come again.
+
+    Returns: All candidates, (I + 1, M); the last ones or, of a cycle, those of least cost; "fixed
+        point", "cycle" or "limit".
+    """
+    history, outcome, first = [start], "limit", 0
+    costs: list[float] = []
+    while len(costs) < iterations and outcome == "limit":
+        new, cost = step(history[-1])
+        first = len(costs)
+        costs.append(cost)
+        seen = [i for i, old in enumerate(history) if np.array_equal(old, new)]
+        if seen:
+            outcome = "fixed point" if seen[-1] == first else "cycle"
+            first = seen[-1]
+        history.append(new)
+    return np.array(history), history[first + 1 + int(np.argmin(costs[first:]))], outcome
 
 
 def _median(distances: Floats) -> float:
@@ -147,98 +153,31 @@ def _median(distances: Floats) -> float:
     return float(np.median(distances)) or 1.0
 
 
-def nearest_view(source: Basis, views: Sequence[View]) -> Numbers:
-    """Which view each prototype of A is nearer to: whose flow explains it better, (M,).
-
-    Flow magnitude would not tell: where lips part or meet, a flow may be small and wrong.
-    """
-    errors = [
-        [
-            explanation_error(source.images[v.reference_a], image, flow, source.w_t)
-            for image, flow in zip(source.images, v.flows_a, strict=True)
-        ]
-        for v in views
-    ]
-    return np.asarray(np.argmin(errors, axis=0), np.int64)
-
-
-def flow_distances(
-    source: Basis, views: Sequence[View], view: Numbers, *, backend: str = "warp"
-) -> Floats:
-    """Eq. 7: how far the flow of each frame of B is from that of each prototype of A, (M, N) [px].
-
-    Sums over A's pixels, weighted by w_f, over the sum of the weights.
-    """
-    kernels = get_backend(backend)
-    y, x = np.nonzero(source.w_f > LIP)
-    p, weight = np.stack([x, y], axis=1).astype(np.float64), source.w_f[y, x]
-    distance = np.empty((len(view), len(views[0].flows_b)))
-    for r, v in enumerate(views):
-        mine = np.flatnonzero(view == r)
-        if not len(mine):
-            continue
-        at = v.correspondence(p)
-        queries = v.correspondence(p + v.flows_a[mine][:, y, x]) - at  # C_syn at S(p), (K, P, 2)
-        points = np.broadcast_to(at.astype(np.float32), (len(v.flows_b), *at.shape))
-        corpus = kernels.sample(*map(kernels.to_device, (v.flows_b, points.copy())))
-        moved = (kernels.to_device(a) for a in (queries.astype(np.float32), weight))
-        query, importance = moved
-        distance[mine] = kernels.to_host(kernels.distance_scan(query, corpus, importance))
-    return distance / float(weight.sum())
-
-
 def texture_coordinates(
     source: Basis, views: Sequence[View], view: Numbers, *, backend: str = "warp"
 ) -> Floats:
     """Eq. 8: beta_{i,k} of prototype k of A in the other prototypes, column k, (M, M)."""
-    kernels = get_backend(backend, 1)
-    bases = [replace(source, flows=v.flows_a) for v in views]
-    pixels = np.flatnonzero(source.w_t > MOUTH)
-    weight = np.sqrt(source.w_t.ravel()[pixels])
-    every = np.arange(len(view))
-
-    def one(k: int, _: Any) -> Floats:
-        others = every[every != k]
-        basis = bases[view[k]]
-        warped = kernels.to_host(warp_prototypes(basis, basis.flows[k], others, kernels))
-        warped = warped.reshape(len(others), -1, 3)
-        column = np.zeros(len(every))
-        column[others] = _fit_mixture(warped, source.images[k], pixels, weight)
-        return column
-
-    return np.stack(list(map_ordered(one, every.tolist(), threads=default_threads())), axis=1)
-
-
-def _fit_mixture(warped: F32, image: F32, pixels: NDArray[np.int64], weight: F32) -> Floats:
-    """The weights (n,) on the simplex with which pictures mix to `image` best.
-
-    warped: (n, h w, 3). image: (h, w, 3). pixels, weight: those that count, and sqrt(w_t) there.
-    """
-    a = (warped[:, pixels] * weight[:, None]).reshape(len(warped), -1)
-    b = (image.reshape(-1, 3)[pixels] * weight[:, None]).ravel()
-    return solve_simplex(a @ a.T, a @ b)
-
-
-def synthetic_flows(views: Sequence[View], view: Numbers, shape: tuple[int, int]) -> F32:
-    """C_syn,k on B's own pixels, (M, h', w', 2) [px]: where S(p) = q, it is S(p + C_k(p)) - q.
-
-    Outside of A's region there is no flow.
-    """
-    q = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
-    origins = [v.correspondence.inverse(q) for v in views]
-    flows = np.empty((len(view), *shape, 2), np.float32)
-    for k, r in enumerate(view):
-        p, v = origins[r], views[r]
-        at = p.astype(np.float32)
-        moved = cv2.remap(v.flows_a[k], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        flows[k] = v.correspondence(p + moved) - q
-    return flows
+    kernels = get_backend(backend)
+    root = np.where(source.w_t > MOUTH, np.sqrt(source.w_t), 0).astype(np.float32)[..., None]
+    scale = kernels.to_device(planes(root)[0])
+    wanted = planes(source.images * root).reshape(len(view), -1)
+    every, beta = np.arange(len(view), dtype=np.int32), np.zeros((len(view), len(view)))
+    for r, v in enumerate(views):
+        mine = np.flatnonzero(view == r)
+        held = kernels.hold_prototypes(source.images, v.flows_a, HOLE) if len(mine) else None
+        for k in mine:
+            others = every[every != k]
+            flow, used = map(kernels.to_device, (planes(v.flows_a[k : k + 1]), others))
+            moved = kernels.to_host(kernels.move_prototypes(held, flow, used, scale))
+            a = moved.reshape(len(others), -1)
+            beta[others, k] = solve_simplex(a @ a.T, a @ wanted[k])
+    return beta
 
 
 class _TextureScan:
     """Eq. 9-10 for changing candidates: distances (M, N), mean over B's pixels under w_t.
 
-    A synthesis whose own candidates have not changed is not made again.
+    flows: Those that the prototypes have in B's face, (M, h', w', 2). beta: of Eq. 8.
     """
 
     def __init__(
@@ -246,23 +185,25 @@ class _TextureScan:
         target: Basis,
         views: Sequence[View],
         view: Numbers,
+        flows: F32,
         beta: Floats,
         backend: str,
     ):
-        self._target, self._views, self._view, self._beta = target, views, view, beta
-        self._flows = synthetic_flows(views, view, target.w_t.shape)
-        self._kernels, self._one = get_backend(backend), get_backend(backend, 1)
+        self._target, self._views, self._view = target, views, view
+        self._kernels = get_backend(backend)
+        self._flows, self._beta = planes(flows), np.where(beta > NO_TEXTURE, beta, 0)
         self._pixels = np.flatnonzero(target.w_t > MOUTH)
         weight = target.w_t.ravel()[self._pixels]
         frames = np.stack([self._seen(image) for image in target.images])
         self._frames, self._weight = map(self._kernels.to_device, (frames, weight / weight.sum()))
-        self._made: dict[int, tuple[bytes, F32]] = {}
 
     def __call__(self, candidates: Numbers) -> Floats:
-        numbers = range(len(self._view))
-        work = [(k, candidates) for k in numbers]
-        made = list(map_ordered(self._synthesis, work, threads=default_threads()))
-        queries = self._kernels.to_device(np.stack(made))
+        made = np.empty((len(self._view), len(self._pixels), 3), np.float32)
+        for r in range(len(self._views)):
+            mine = np.flatnonzero(self._view == r)
+            if len(mine):
+                made[mine] = self._syntheses(r, mine, candidates)
+        queries = self._kernels.to_device(made)
         scanned = self._kernels.distance_scan(queries, self._frames, self._weight)
         return np.asarray(self._kernels.to_host(scanned), np.float64)
 
@@ -271,18 +212,20 @@ class _TextureScan:
         smooth = cv2.GaussianBlur(image, (0, 0), SMOOTHED * self._target.region.mouth[2])
         return np.asarray(smooth.reshape(-1, 3)[self._pixels], np.float32)
 
-    def _synthesis(self, item: tuple[int, Numbers], _: Any) -> F32:
-        """I_syn,k at the pixels that count, (P, 3)."""
-        k, candidates = item
-        used = np.flatnonzero(self._beta[:, k] > NO_TEXTURE)
-        frames = candidates[used]
-        known = self._made.get(k)
-        if known is not None and known[0] == frames.tobytes():
-            return known[1]
-        flows = self._views[self._view[k]].flows_b[frames]
-        basis = replace(self._target, images=self._target.images[frames], flows=flows)
-        every = np.arange(len(used))
-        warped = self._one.to_host(warp_prototypes(basis, self._flows[k], every, self._one))
-        made = self._seen(np.tensordot(self._beta[used, k].astype(np.float32), warped, axes=1))
-        self._made[k] = (frames.tobytes(), made)
-        return made
+    def _syntheses(self, r: int, mine: Numbers, candidates: Numbers) -> F32:
+        """I_syn of the prototypes `mine` (K,), all of view r, at the pixels that count, (K, P, 3).
+
+        A frame that is the candidate of several prototypes is warped once.
+        """
+        k, beta = self._kernels, self._beta[:, mine]
+        used = np.flatnonzero(beta.any(axis=1))
+        frames, which = np.unique(candidates[used], return_inverse=True)
+        weights = np.zeros((len(frames), len(mine)))
+        np.add.at(weights, which, beta[used])
+        images, flows = self._target.images[frames], self._views[r].flows_b[frames]
+        height, width = self._target.w_t.shape
+        everywhere = np.ones((height, self._flows.shape[-1]), np.float32)
+        given = self._flows[mine], weights.T.astype(np.float32, order="C"), everywhere
+        held = k.hold_prototypes(images, flows, HOLE)
+        made = k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
+        return np.stack([self._seen(picture(one, width)) for one in made])

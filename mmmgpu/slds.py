@@ -18,6 +18,7 @@ Source: Englebienne, Cootes & Rattray (NIPS 2007), section 3.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -25,6 +26,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mmmgpu.errors import UnsettledWarning
 from mmmgpu.flat_records import tensor
 from mmmgpu.kalman import Posterior, System, inverse, multiply, smooth, symmetric, transpose
 from mmmgpu.labelled import (
@@ -70,20 +72,9 @@ class Slds:
     comparable: ClassVar[bool] = True
 
     @classmethod
-    def fit(
-        cls, sequences: Sequence[ArrayLike], labels: Sequence[Sequence[str]], *, full: bool = False
-    ) -> Slds:
-        """Maximum likelihood by EM.
-
-        Args:
-            sequences: S arrays of shape (T_s, d).
-            labels: The labels of each.
-            full: Matrices in place of diagonals: (d / 3)^2 times as slow, or worse.
-
-        Raises:
-            InputError: As `labelled.check_labelled`.
-        """
-        return climb(check_labelled(sequences, labels), full=full)[0]
+    def fit(cls, sequences: Sequence[ArrayLike], labels: Sequence[Sequence[str]]) -> Slds:
+        """Maximum likelihood by EM; arguments and errors are those of `labelled.check_labelled`."""
+        return climb(check_labelled(sequences, labels))[0]
 
     def generate(self, labels: Iterable[str]) -> Iterator[Floats]:
         """The most likely frame (d,) for each label, as they come."""
@@ -127,6 +118,15 @@ class Slds:
         return System(*(in_blocks(getattr(self, n), full=self.A.ndim == 3) for n in names))
 
 
+class FullSlds(Slds):
+    """A linear system with matrices in place of diagonals: (d / 3)^2 times as slow, or worse."""
+
+    @classmethod
+    def fit(cls, sequences: Sequence[ArrayLike], labels: Sequence[Sequence[str]]) -> Slds:
+        """As `Slds.fit`."""
+        return climb(check_labelled(sequences, labels), full=True)[0]
+
+
 def in_blocks(parameter: Floats, *, full: bool) -> Floats:
     """(Q, d) or (Q, d, d) as (Q, G, b, 1) or (Q, G, b, b)."""
     if parameter.ndim == 3:
@@ -135,14 +135,14 @@ def in_blocks(parameter: Floats, *, full: bool) -> Floats:
 
 
 def climb(
-    data: Labelled, *, full: bool = False, iterations: int = 100, tolerance: float = 1e-4
+    data: Labelled, *, full: bool = False, iterations: int = 1000, tolerance: float = 1e-4
 ) -> tuple[Slds, list[float]]:
     """EM from a start that the pooled Gaussians give.
 
     Args:
         data: What to fit.
-        full: As in `Slds.fit`.
-        iterations: At most so many.
+        full: Fit a `FullSlds`.
+        iterations: At most so many; an `UnsettledWarning` says that they were too few.
         tolerance: The climb ends when an iteration gains less [nats a frame and dimension].
 
     Returns:
@@ -161,6 +161,9 @@ def climb(
             return model, history
         model = _maximise(model, found, least)
     history.append(_expect(model.system, parts, len(data.labels))[1])
+    warnings.warn(
+        UnsettledWarning(f"slds: still gaining after {iterations} iterations"), stacklevel=2
+    )
     return model, history
 
 
@@ -169,7 +172,8 @@ def _start(data: Labelled, *, full: bool) -> Slds:
     mean, variance = gaussians(data)
     spread = variance[:, :, None] * np.eye(mean.shape[1]) if full else variance
     half = np.zeros_like(spread) + (np.eye(mean.shape[1]) if full else 1) / 2
-    return Slds(data.labels, mean, spread, half, mean / 2, spread / 4, spread / 4)
+    kind = FullSlds if full else Slds
+    return kind(data.labels, mean, spread, half, mean / 2, spread / 4, spread / 4)
 
 
 @dataclass(frozen=True)
@@ -272,7 +276,9 @@ def _maximise(model: Slds, s: _Moments, least: Floats) -> Slds:
     R = np.where(seen_any, at_least(s.noise / everything, least), old.R)
     shapes = (model.mu, model.Sigma, model.A, model.nu, model.Q, model.R)
     new = (mu, Sigma, A, nu, Q, R)
-    return Slds(model.labels, *(v.reshape(o.shape) for v, o in zip(new, shapes, strict=True)))
+    return type(model)(
+        model.labels, *(v.reshape(o.shape) for v, o in zip(new, shapes, strict=True))
+    )
 
 
 def at_least(covariance: Floats, least: Floats) -> Floats:

@@ -8,7 +8,7 @@ type `free`, which players skip.
 
 import os
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
@@ -38,16 +38,22 @@ class Sentence:
     frames: int
 
 
-def find_clips(folder: Path) -> dict[str, dict[str, Path]]:
+def find_clips(
+    folder: Path, conditions: Collection[str] | None = None
+) -> dict[str, dict[str, Path]]:
     """The files FOLDER/CONDITION/SENTENCE.*, by sentence and condition, both sorted.
 
+    conditions: those that are wanted; None: all that there are.
+
     Raises:
-        InputError: There are fewer than two conditions; one of them lacks a sentence that another
-            has, or has it twice.
+        InputError: There are fewer than two conditions, or not one that is wanted; one of them
+            lacks a sentence that another has, or has it twice.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give one with a folder of clips per condition")
     homes = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    if conditions is not None:
+        homes = _chosen(homes, conditions, folder)
     if len(homes) < 2:
         raise InputError(
             f"{folder}: has {len(homes)} folder(s) in it, but two conditions at least are needed; "
@@ -64,6 +70,14 @@ def find_clips(folder: Path) -> dict[str, dict[str, Path]]:
                     "put it there, or take the sentence out everywhere"
                 )
     return {s: {home.name: found[home.name][s] for home in homes} for s in sentences}
+
+
+def _chosen(homes: Sequence[Path], conditions: Collection[str], folder: Path) -> list[Path]:
+    has = [home.name for home in homes]
+    for name in conditions:
+        if name not in has:
+            raise InputError(f"{folder}: has no folder '{name}'; choose from {', '.join(has)}")
+    return [home for home in homes if home.name in conditions]
 
 
 def _by_sentence(home: Path) -> dict[str, Path]:

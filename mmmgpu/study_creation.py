@@ -31,6 +31,7 @@ SEED_BITS = 32
 class StudyOptions:
     """How a study is made.
 
+    conditions: the folders that are taken; None: all.
     real: the condition whose sound all clips get, and whose clips attention checks are made from.
     participants: how many links there are; unused ones do no harm.
     pairs: a participant; None: each ordered pair of conditions once.
@@ -40,6 +41,7 @@ class StudyOptions:
     introduction: what participants read first.
     """
 
+    conditions: tuple[str, ...] | None = None
     real: str = "reality"
     participants: int = 40
     pairs: int | None = None
@@ -65,11 +67,11 @@ def create_study(
             called `options.real`; a number of `options` is out of range; `out` exists already.
     """
     _check(options)
-    found = find_clips(Path(clips))
+    found = find_clips(Path(clips), options.conditions)
     conditions = sorted(next(iter(found.values())))
     if options.real not in conditions:
         raise InputError(
-            f"{clips}: has no folder '{options.real}'; say with --real which of them is real: "
+            f"{clips}: '{options.real}' is none of the conditions; say with --real which is real: "
             f"{', '.join(conditions)}"
         )
     sentences = [

@@ -113,21 +113,3 @@ def synthesize_batch(synthesizer: Synthesizer, alpha: Floats, beta: Floats) -> F
         part = image[s.inside]
         part += picture(one, part.shape[1])
     return np.minimum(made, 1, out=made)
-
-
-def warp_prototypes(
-    basis: Basis, flow: F32, used: NDArray[np.int64], kernels: Backend
-) -> NDArray[np.float32]:
-    """The prototypes `used` (n,), each moved along C_syn = `flow`: device array (n, h, w, 3).
-
-    The chain of single operations: for a basis of which no more than one frame is asked.
-    """
-    everything = len(used) == len(basis.images)
-    flows = basis.flows if everything else basis.flows[used]
-    images = basis.images if everything else basis.images[used]
-    residual = kernels.to_device(flow[None] - flows)
-    moved, weight = kernels.forward_warp(residual, kernels.to_device(flows))
-    oriented = kernels.fill_holes(moved, weight, HOLE)
-    texture, weight = kernels.forward_warp(kernels.to_device(images), oriented)
-    filled: NDArray[np.float32] = kernels.fill_holes(texture, weight, HOLE)
-    return filled

@@ -154,19 +154,20 @@ def _above(a: NDArray[Any], b: NDArray[Any]) -> Bytes:
 
 def _history(model: Model) -> str:
     found = model.notes["matching"]
-    history = np.array(found["history"])
-    rows = []
-    for i, candidates in enumerate(history):
-        changed = int((candidates != history[i - 1]).sum()) if i else len(candidates)
-        rows.append(
-            [
-                "flow alone" if i == 0 else f"iteration {i}",
-                str(changed),
-                str(len(set(candidates.tolist()))),
-                f"{np.mean(found['flow_distance'][i]):.3f}",
-                f"{np.mean(found['texture_distance'][i]):.3f}",
-            ]
-        )
+    by_flow, by_both = np.array(found["flow_history"]), np.array(found["history"])
+    rows = [
+        ["flow, calibrated" if i else "flow", *_counts(by_flow, i), "", ""]
+        for i in range(len(by_flow))
+    ]
+    rows += [
+        [
+            f"flow and texture, iteration {i}" if i else "of these, at the start",
+            *_counts(by_both, i),
+            f"{np.mean(found['flow_distance'][i]):.3f}",
+            f"{np.mean(found['texture_distance'][i]):.3f}",
+        ]
+        for i in range(len(by_both))
+    ]
     head = ("candidates", "changed", "different frames", "flow distance", "texture distance")
     used = found["reference"]
     said = ", ".join(f"{kind}: {used.count(kind)}" for kind in dict.fromkeys(used))
@@ -175,6 +176,12 @@ def _history(model: Model) -> str:
         f"median over all frames. The search ended in a {escape(found['outcome'])}. Prototypes by "
         f"the reference they were compared from: {escape(said)}.</p>" + table(head, rows)
     )
+
+
+def _counts(history: NDArray[np.int64], i: int) -> tuple[str, str]:
+    """How many candidates changed in step i, and how many frames are among them."""
+    changed = (history[i] != history[i - 1]).sum() if i else history.shape[1]
+    return str(int(changed)), str(len(set(history[i].tolist())))
 
 
 def _vowels(source: Model | None, before: Model, after: Model | None, backend: str) -> str:

@@ -33,8 +33,9 @@ from mmmgpu.corpus_steps import (
 )
 from mmmgpu.correspondence import Correspondence, rbf_correspondence
 from mmmgpu.errors import InputError
+from mmmgpu.flow_matching import SMOOTHING, View
 from mmmgpu.flows import Matcher, best_flow, best_of, concatenate, matcher
-from mmmgpu.matching import BALANCE, Matching, View, match_prototypes
+from mmmgpu.matching import BALANCE, Matching, match_prototypes
 from mmmgpu.models import Model
 from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.points import CLOSED, PointPair, check_frames, read_points
@@ -178,7 +179,7 @@ class _Transfer:
         views = [
             View(
                 self.marked[kind].prototype,
-                self._correspondence(frames, kind, near),
+                self._correspondence(frames, kind, near, smoothing=SMOOTHING),
                 self._source_flows(kind),
                 flow,
             )
@@ -203,7 +204,7 @@ class _Transfer:
             prototype_frames=whole,
             sources=sources,
             calm=calmest(frames),
-            notes=self._notes(frames, skipped, matching, views),
+            notes=self._notes(frames, skipped, matching, near),
         )
 
     def _reference(self) -> Reference:
@@ -231,7 +232,9 @@ class _Transfer:
         at = self.marked[kind].pair.b
         return frames.number(at.clip, at.frame)
 
-    def _correspondence(self, frames: Frames, kind: str, region: Region) -> Correspondence:
+    def _correspondence(
+        self, frames: Frames, kind: str, region: Region, smoothing: float = 0.0
+    ) -> Correspondence:
         """S of a pair, from the pixels of A's stabilised region to those of `region` of B."""
         marked = self.marked[kind]
         pose_a = np.eye(3)
@@ -241,11 +244,12 @@ class _Transfer:
         pose_b = frames.tracks[marked.pair.b.clip].poses[marked.pair.b.frame]
         a = _carried_back(pose_a, marked.pair.points_a) - self.source.basis.region.box[:2]
         b = _carried_back(pose_b, marked.pair.points_b) - region.box[:2]
-        return rbf_correspondence(a, b)
+        return rbf_correspondence(a, b, smoothing=smoothing)
 
-    def _folded(self, kind: str, s: Correspondence) -> float:
-        """Share of A's mouth that `s` folds over; a warning says so."""
+    def _folded(self, frames: Frames, kind: str, region: Region) -> float:
+        """Share of A's mouth that S folds over; a warning says so."""
         mouth = self.source.basis.w_t > MOUTH
+        s = self._correspondence(frames, kind, region)
         share = float(s.folds(*mouth.shape[::-1])[mouth].mean())
         if share:
             print(
@@ -309,7 +313,7 @@ class _Transfer:
         frames: Frames,
         skipped: Mapping[str, str],
         matching: Matching,
-        views: Sequence[View],
+        region: Region,
     ) -> dict[str, Any]:
         kinds = list(self.marked)
         return {
@@ -324,15 +328,13 @@ class _Transfer:
                 "balance": self.options.balance,
                 "outcome": matching.outcome,
                 "iterations": len(matching.history) - 1,
+                "flow_history": matching.flow_history.tolist(),
                 "history": matching.history.tolist(),
                 "flow_distance": np.round(matching.flow_distance, 6).tolist(),
                 "texture_distance": np.round(matching.texture_distance, 6).tolist(),
                 "reference": [kinds[v] for v in matching.view],
                 "different_frames": len(set(matching.chosen.tolist())),
-                "folded_share": {
-                    kind: self._folded(kind, view.correspondence)
-                    for kind, view in zip(kinds, views, strict=True)
-                },
+                "folded_share": {kind: self._folded(frames, kind, region) for kind in kinds},
             },
         }
 

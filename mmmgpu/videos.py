@@ -21,7 +21,7 @@ from av.sidedata.sidedata import Type as SideDataType
 from av.video.frame import VideoFrame
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 from av.video.stream import VideoStream
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 
@@ -128,21 +128,39 @@ def read_frames(
     `probe(path).frames`. Frames before `start` are decoded but not converted. Raises InputError
     as `probe` does, and where decoding ends early.
     """
+    yield from _read(path, lambda count: np.arange(start, count if stop is None else stop))
+
+
+def read_chosen_frames(
+    path: str | os.PathLike[str], chosen: ArrayLike
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames whose numbers are `chosen`, rising; otherwise as `read_frames`.
+
+    Frames between them are decoded but not converted.
+    """
+    yield from _read(path, lambda count: np.asarray(chosen, np.int64))
+
+
+def _read(
+    path: str | os.PathLike[str], choose: Callable[[int], NDArray[np.int64]]
+) -> Iterator[NDArray[np.uint8]]:
+    """The frames that `choose` names, rising, when told how many there are."""
     scan = _scan(path)
-    stop = int(scan.repeats.sum()) if stop is None else stop
+    wanted = choose(int(scan.repeats.sum()))
     shown = np.cumsum(scan.repeats)  # after each source frame
+    times = np.bincount(np.searchsorted(shown, wanted, side="right"), minlength=len(shown) + 1)
+    left = len(wanted)
     convert = _converter(path, scan)
     seen = 0
     with open_media(path) as media:
         for frame in media.decode(video_stream(media, path)):
-            if seen == len(shown) or (seen > 0 and shown[seen - 1] >= stop):
+            if seen == len(shown) or (seen > 0 and not left):
                 return
-            first = max(start, int(shown[seen] - scan.repeats[seen]))
-            last = min(stop, int(shown[seen]))
-            if first < last:
+            if times[seen]:
                 image = convert(frame)
-                for _ in range(first, last):
+                for _ in range(times[seen]):
                     yield image
+            left -= times[seen]
             seen += 1
     if seen < len(shown):
         raise InputError(

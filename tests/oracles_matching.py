@@ -5,7 +5,9 @@ import oracles_model
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import fsolve
 
-from mmmgpu.matching import LIP, MOUTH, SMOOTHED
+from mmmgpu.basis import LIP, MOUTH
+from mmmgpu.flow_matching import KEPT, RIDGE, ROUNDS
+from mmmgpu.matching import SMOOTHED
 
 
 def flow_distance(source, view, k, n):
@@ -18,6 +20,49 @@ def flow_distance(source, view, k, n):
         total += source.w_f[y, x] * np.hypot(*(wanted - real))
         weights += source.w_f[y, x]
     return total / weights
+
+
+def calibrated_distances(source, view, chosen, number):
+    """Eq. 7 with C', all prototypes (M, N) [px], by singular vectors of B's flows under w_f."""
+    s = view.correspondence
+    at = np.argwhere(source.w_f > LIP)
+    root = np.array([source.w_f[y, x] for y, x in at]) ** 0.5
+    root /= np.linalg.norm(root)
+    starts = np.array([s(np.array([x, y], float)) for y, x in at])
+    wanted = np.array(
+        [[s(np.array([x, y]) + flow[y, x].astype(float)) for y, x in at] for flow in view.flows_a]
+    )
+    wanted -= starts
+    real = np.array(
+        [[oracles_model.bilinear(f.astype(float), *p) for p in starts] for f in view.flows_b]
+    )
+    v = np.linalg.svd((real * root[:, None]).reshape(len(real), -1), full_matrices=False)[2]
+    v = v[:number]
+    z, y = ((flows * root[:, None]).reshape(len(flows), -1) @ v.T for flows in (wanted, real))
+    linear, offset = robust_map(z, y[chosen])
+    made = []
+    for k in range(len(z)):
+        spanned, rest = (z[k] @ v).reshape(-1, 2), wanted[k] * root[:, None]
+        carried = ((linear @ z[k] + offset) @ v).reshape(-1, 2)
+        made.append((carried + KEPT * (rest - spanned)) / root[:, None])
+    return np.array(
+        [[(root**2 * np.linalg.norm(m - r, axis=-1)).sum() for r in real] for m in made]
+    )
+
+
+def robust_map(z, y):
+    """T and o by stacked least squares: the rows under their weights, and rows for the ridge."""
+    size = z.shape[1]
+    weights = np.ones(len(z))
+    ridge = np.sqrt(RIDGE * (z**2).mean()) * np.eye(size, size + 1)
+    for _ in range(ROUNDS):
+        rows = [np.sqrt(w) * np.append(a, 1) for w, a in zip(weights, z, strict=True)]
+        right = [np.sqrt(w) * b for w, b in zip(weights, y, strict=True)]
+        system = np.concatenate([rows, ridge])
+        solved = np.linalg.lstsq(system, np.concatenate([right, ridge[:, :size]]), rcond=None)[0]
+        errors = [np.linalg.norm(b - np.append(a, 1) @ solved) for a, b in zip(z, y, strict=True)]
+        weights = [min(1, np.median(errors) / e) ** 2 for e in errors]
+    return solved[:size].T, solved[size]
 
 
 def synthetic_flow(view, k, shape):

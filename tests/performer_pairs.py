@@ -11,9 +11,9 @@ from worlds import hold, say, sentence_motion
 
 from mmmgpu.basis import Basis, make_basis, still_outside
 from mmmgpu.correspondence import rbf_correspondence
+from mmmgpu.flow_matching import SMOOTHING, View
 from mmmgpu.flows import best_flow, matcher
 from mmmgpu.marking import LANDMARK_ROWS
-from mmmgpu.matching import View
 from mmmgpu.parallel import map_ordered, one_thread_each
 from mmmgpu.performer import ARTICULATORS, Articulation, Performer, landmarks, performer, render
 from mmmgpu.performer_geometry import columns, pucker
@@ -166,7 +166,7 @@ def views_of(pair, kinds=("closed", "open"), noise=0.0, seed=0):
         rng = np.random.default_rng([seed, numbers[kind]])
         points = points_of(pair, numbers[kind])
         at = [p + noise * rng.standard_normal(p.shape) for p in points]
-        s = rbf_correspondence(*at)
+        s = rbf_correspondence(*at, smoothing=SMOOTHING)
         views.append(View(numbers[kind], s, pair.flows_a[kind], pair.flows_b[kind]))
     return views
 
@@ -191,11 +191,11 @@ def points_of(pair, k):
     return at[0][kept], at[1][kept]
 
 
-def target_of(pair, views):
+def target_of(pair):
     """B's frames, with A's masks carried over as transfer does."""
+    s = rbf_correspondence(*points_of(pair, 0))
     masks = [
-        carried_mask(mask, views[0].correspondence, pair.target.w_t.shape)
-        for mask in (pair.source.w_f, pair.source.w_t)
+        carried_mask(mask, s, pair.target.w_t.shape) for mask in (pair.source.w_f, pair.source.w_t)
     ]
     return replace(pair.target, w_f=masks[0], w_t=masks[1])
 

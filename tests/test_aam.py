@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mmmgpu.aam import complete_clip, features, reconstruct, see_clip, track
+from mmmgpu.aam import complete_clip, features, reconstruct, see_clip
 from mmmgpu.appearances import synthesize_shape
 from mmmgpu.errors import InputError
 from mmmgpu.pictures import psnr
@@ -60,17 +60,6 @@ def test_a_clip_is_reconstructed_from_its_features(drawn, seen):
 def test_features_of_another_clip_are_refused(drawn, seen, change):
     with pytest.raises(InputError, match=r"features for .*clip 3\.mkv must be finite, of shape"):
         list(reconstruct(drawn.aam, change(seen.features), drawn.held_out, drawn.folder))
-
-
-def test_a_clip_is_tracked_from_its_first_frame(drawn):
-    truth = drawn.points(drawn.held_out)[:12]
-    found = []
-    for result in track(drawn.aam, drawn.held_out, truth[0] + (2, 1)):
-        found.append(result.shape)
-        if len(found) == len(truth):
-            break
-    miss = np.sqrt(((np.array(found) - truth) ** 2).sum(axis=2).mean(axis=1))
-    assert (miss < 1).all()
 
 
 def test_a_clip_with_other_landmarks_than_the_models_is_refused(drawn, tmp_path):

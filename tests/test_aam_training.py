@@ -83,17 +83,18 @@ def test_a_share_of_variance_gives_as_many_parameters_as_it_needs(drawn):
 
 
 def test_what_is_learned_from_is_bounded_and_spread(drawn, monkeypatch):
-    read = []
-    frames = aam_training.read_frames
+    read = {}
+    frames = aam_training.read_chosen_frames
 
-    def counted(path, **span):
-        read.append((path, span))
-        return frames(path, **span)
+    def noted(path, chosen):
+        read[path] = len(chosen)
+        return frames(path, chosen)
 
-    monkeypatch.setattr(aam_training, "read_frames", counted)
+    monkeypatch.setattr(aam_training, "read_chosen_frames", noted)
     aam = fit_aam(drawn.clips, drawn.folder, parameters=4, frames=9)
-    assert aam.notes["frames"] == 9
-    assert sorted(path for path, _ in read) == sorted(drawn.clips)
+    assert aam.notes["frames"] == sum(read.values()) == 9
+    assert sorted(read) == sorted(drawn.clips)
+    assert max(read.values()) - min(read.values()) <= 1
 
 
 def test_the_whole_is_counted_in_the_notes(drawn):
@@ -170,6 +171,7 @@ def freeze(points):
     ("options", "says"),
     [
         ({"parameters": 0}, "parameters must be at least 1"),
+        ({"parameters": 3, "variance": 0.9}, "parameters and variance: .* give one of them"),
         ({"variance": 0.0}, "variance must be a share"),
         ({"variance": 1.2}, "variance must be a share"),
         ({"variance": float("nan")}, "variance must be a share"),

@@ -10,9 +10,9 @@ from mmmgpu.errors import InputError
 from mmmgpu.gdlr import (
     RULES,
     Descent,
-    bounded_steps,
+    bounded_metrics,
     descend_means,
-    paper_steps,
+    paper_metrics,
     standard_units,
 )
 from mmmgpu.linear_adaptation import map_means, regress_means
@@ -158,8 +158,9 @@ def candidate_mean(models, clips, method, constants):
     system = factor_system(line, models, np.full(D, SMOOTHNESS))
     m, s = standard_units(models)
     mean = (models.mean - m) / s
-    steps = constants["rate"] * bounded_steps(system, mean, rows)
-    path = descend_means(system, mean, (z - m) / s, rows, steps=steps)
+    chosen = {key: constants[key] for key in ("shape", "damping")}
+    metric = next(own for one, own in bounded_metrics(system, mean, rows) if one == chosen)
+    path = descend_means(system, mean, (z - m) / s, rows, metric=constants["rate"] * metric)
     return m + s * path[constants["iterations"]]
 
 
@@ -204,8 +205,9 @@ def test_only_what_every_fold_has_is_chosen_from(world):
 def adapt_path(models, clips, descent):
     system = factor_system(lay_out_utterances(models, clips), models, np.full(D, SMOOTHNESS))
     rows, z = class_rows(models, CLASSES), np.concatenate([u.z for u in clips])
-    steps = descent.rates[0] * paper_steps(system, models.mean, rows)
-    return descend_means(system, models.mean, z, rows, steps=steps, iterations=descent.iterations)
+    ((_, metric),) = paper_metrics(system, models.mean, rows)
+    metric = descent.rates[0] * metric
+    return descend_means(system, models.mean, z, rows, metric=metric, iterations=descent.iterations)
 
 
 def test_full_covariances_are_adapted_too(world):

@@ -19,8 +19,9 @@ from mmmgpu.analysis import _fit_texture as fit_texture
 from mmmgpu.analysis import _refine as refine
 from mmmgpu.backends import get_backend
 from mmmgpu.backends.planes import planes
+from mmmgpu.basis import MOUTH
 from mmmgpu.errors import InputError
-from mmmgpu.synthesis import synthesize
+from mmmgpu.synthesis import HOLE, synthesize
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +208,20 @@ def test_both_backends_find_the_same(basis, analyzer, backend):
     got = analyze(prepare_analysis(basis, get_backend(backend)), image)
     for a, b in zip(got, wanted, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
+
+
+def test_beta_explains_the_pixels_of_the_mask_and_no_others(basis, analyzer, kernels):
+    rng = np.random.default_rng(0)
+    image = np.where(basis.w_t[..., None] > 0.2, basis.images[1], rng.random(basis.images[1].shape))
+    alpha, beta = analyze(analyzer, image.astype(np.float32))
+    part = analyzer.basis
+    residual = part.flow(alpha)[None] - part.flows
+    oriented = kernels.fill_holes(*kernels.forward_warp(residual, part.flows), HOLE)
+    moved = kernels.fill_holes(*kernels.forward_warp(part.images, oriented), HOLE)
+    weight = np.where(part.w_t > MOUTH, part.w_t, 0)[..., None]
+    gram = np.einsum("mhwc,nhwc->mn", weight * moved, moved)
+    right = np.einsum("mhwc,hwc->m", weight * moved, image[analyzer.inside])
+    np.testing.assert_allclose(beta, solve_simplex(gram, right), rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(3))

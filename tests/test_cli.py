@@ -23,7 +23,7 @@ from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
 
 COMMANDS = ("demo", "align", "train", "reconstruct", "speak", "evaluate")
-COMMANDS += ("mark", "transfer", "adapt", "aam", "bench", "compare", "info")
+COMMANDS += ("mark", "transfer", "adapt", "aam", "track", "bench", "compare", "info")
 SLOW = {"av", "cv2", "matplotlib", "numpy", "rich", "scipy", "sklearn", "warp"}
 
 
@@ -349,6 +349,24 @@ def test_align_by_models_of_the_clips_themselves(mmmgpu, foreign, tmp_path):
     before = {p.name: p.read_bytes() for p in out.iterdir()}
     assert mmmgpu("align", *clips, *args).status == 0
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+def test_a_transcript_of_other_words_is_said(mmmgpu, foreign, tmp_path):
+    folder, rng = tmp_path / "sounds", np.random.default_rng(5)
+    folder.mkdir()
+    for i in range(9):
+        samples, _ = hmms.utter(hmms.SENTENCES[i % 6], rng)
+        write_wav(folder / f"{i}.wav", samples.astype(np.float32), hmms.RATE)
+        (folder / f"{i}.txt").write_text(hmms.SENTENCES[i % 6], encoding="utf-8")
+    (folder / "7.txt").write_text(hmms.SENTENCES[5], encoding="utf-8")
+    args = ("--transcripts", folder, "--out", tmp_path / "out", "--aligner", "hmm")
+    args += ("--dictionary", foreign[0] / "words.dict", "--json", tmp_path / "facts.json")
+    ended = mmmgpu("align", *sorted(folder.glob("*.wav")), *args)
+    assert ended.status == 0
+    (line,) = [line for line in ended.err.splitlines() if "warning" in line]
+    assert f"{folder / '7.wav'}: the sound fits its transcript far worse" in line
+    clips = json.loads((tmp_path / "facts.json").read_text())["clips"]
+    assert [clip["suspect"] for clip in clips] == [i == 7 for i in range(9)]
 
 
 def test_align_goes_on_where_its_training_was_killed(mmmgpu, foreign, tmp_path, monkeypatch):

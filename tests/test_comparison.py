@@ -1,4 +1,5 @@
 import json
+import warnings
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -14,8 +15,8 @@ from mmmgpu.comparison_features import SavedFeatures
 from mmmgpu.comparison_scores import METRICS, score
 from mmmgpu.corpora import Clip
 from mmmgpu.dpds import Dpds
-from mmmgpu.dynamics import MODELS, trajectory
-from mmmgpu.errors import InputError
+from mmmgpu.dynamics import FIVE, MODELS, trajectory
+from mmmgpu.errors import InputError, UnsettledWarning
 from mmmgpu.hmm_mean import HmmMean
 from mmmgpu.videos import VideoInfo
 
@@ -65,7 +66,7 @@ def test_a_wrong_number_of_folds_is_refused(folds):
 
 def test_every_model_has_every_number_that_it_can_have(compared):
     _, clips, results = compared
-    assert list(results["models"]) == list(MODELS)
+    assert list(results["models"]) == list(FIVE)
     for name, found in results["models"].items():
         assert tuple(found) == METRICS
         assert (found["log_likelihood"] is None) == (not MODELS[name].comparable)
@@ -93,12 +94,11 @@ def test_nothing_is_left_of_the_work(compared):
     assert not (compared[0] / "work").exists()
 
 
-def few_models(monkeypatch):
-    monkeypatch.setattr(comparison, "MODELS", {"hmm": HmmMean, "dpds": Dpds})
+FEW = ("hmm", "dpds")
 
 
 def run_here(monkeypatch):
-    """Folds are done in this process, with two models; returns the numbers of those done."""
+    """Folds are done in this process; returns the numbers of those done."""
     done = []
 
     def share_out(prepare, shared, items, *, processes, advance):
@@ -107,13 +107,32 @@ def run_here(monkeypatch):
             done.append(item)
 
     monkeypatch.setattr(comparison, "share_out", share_out)
-    few_models(monkeypatch)
     return done
+
+
+class Hasty(HmmMean):
+    """A model whose fit was ended early."""
+
+    @classmethod
+    def fit(cls, sequences, labels):
+        warnings.warn(UnsettledWarning("hmm: still gaining after 7 iterations"), stacklevel=2)
+        return HmmMean.fit(sequences, labels)
+
+
+def test_a_fit_that_was_ended_early_is_said_once_and_kept(tmp_path, monkeypatch, capfd):
+    run_here(monkeypatch)
+    monkeypatch.setattr(comparison, "MODELS", {"hmm": Hasty})
+    options = CompareOptions(folds=2, models=("hmm",))
+    results = compare(corpus(tmp_path), SavedFeatures(tmp_path), tmp_path / "w", options=options)
+    one = ["hmm: still gaining after 7 iterations"]
+    assert results["unsettled"] == {"fold 1": one, "fold 2": one}
+    said = "warning: fits that were ended early: fold 1: hmm: still gaining after 7 iterations; "
+    assert capfd.readouterr().err.count(said) == 1
 
 
 def test_a_killed_comparison_goes_on_and_ends_in_the_same(tmp_path, monkeypatch):
     clips, done = corpus(tmp_path), run_here(monkeypatch)
-    options, saved = CompareOptions(folds=3), SavedFeatures(tmp_path)
+    options, saved = CompareOptions(folds=3, models=FEW), SavedFeatures(tmp_path)
     whole = compare(clips, saved, tmp_path / "work", options=options)
     assert done == [0, 1, 2]
     done.clear()
@@ -144,7 +163,7 @@ def test_a_fold_without_some_phone_is_said(tmp_path, monkeypatch, capsys):
     run_here(monkeypatch)
     clips = corpus(tmp_path)
     clips[2] = sentence(tmp_path, "s2", ["SIL", "B", "AA"], np.ones((3, 2)))
-    options = CompareOptions(folds=3)
+    options = CompareOptions(folds=3, models=FEW)
     results = compare(clips, SavedFeatures(tmp_path), tmp_path / "work", options=options)
     fold = next(f for f, own in enumerate(deal(6, options), start=1) if 2 in own)
     assert results["stand_ins"] == {f"fold {fold}": {"B": "M"}}
@@ -167,17 +186,17 @@ def test_a_fold_that_fails_says_which_sentence(tmp_path, monkeypatch, fault):
     (tmp_path / "s3.npz").unlink()
     if y is not None:
         clips[3] = sentence(tmp_path, "s3", clips[3].labels, y)
+    options = CompareOptions(folds=2, models=FEW)
     with pytest.raises(InputError, match=rf"^fold \d, {message}") as error:
-        compare(clips, SavedFeatures(tmp_path), tmp_path / "work", options=CompareOptions(folds=2))
+        compare(clips, SavedFeatures(tmp_path), tmp_path / "work", options=options)
     assert "\n" not in str(error.value)
 
 
-def test_features_of_another_length_a_frame_name_model_and_fold(tmp_path, monkeypatch):
-    few_models(monkeypatch)
+def test_features_of_another_length_a_frame_name_model_and_fold(tmp_path):
     clips = corpus(tmp_path)
     clips[3] = sentence(tmp_path, "s3", clips[3].labels, np.ones((len(clips[3].labels), 5)))
     with pytest.raises(InputError, match=r"^fold 1, s3: features: .* shape \(T, 2\).* \(\d+, 5\)"):
-        _Fold(0, clips, SavedFeatures(tmp_path), [0], None).run(tmp_path, lambda: None)
+        _Fold(0, clips, SavedFeatures(tmp_path), [0], None, FEW).run(tmp_path, lambda: None)
 
 
 @dataclass(frozen=True)
@@ -192,10 +211,9 @@ class Shown(SavedFeatures):
         Path(f"{out}.npy").rename(out)
 
 
-def test_videos_lie_by_condition_and_sentence(tmp_path, monkeypatch):
-    few_models(monkeypatch)
+def test_videos_lie_by_condition_and_sentence(tmp_path):
     clips = corpus(tmp_path)
-    fold = _Fold(0, clips, Shown(tmp_path), [1, 4], tmp_path / "videos")
+    fold = _Fold(0, clips, Shown(tmp_path), [1, 4], tmp_path / "videos", FEW)
     fold.run(tmp_path, lambda: None)
     found = {p.relative_to(tmp_path / "videos").as_posix() for p in tmp_path.glob("videos/*/*")}
     assert found == {f"{c}/s{i}.mp4" for c in ("hmm", "dpds", REALITY) for i in (1, 4)}
@@ -228,6 +246,6 @@ def test_arithmetic_that_fails_is_said_too(tmp_path, monkeypatch):
             raise FloatingPointError("overflow")
 
     monkeypatch.setattr(comparison, "MODELS", {"hmm": Broken})
-    fold = _Fold(2, corpus(tmp_path), SavedFeatures(tmp_path), [0], None)
+    fold = _Fold(2, corpus(tmp_path), SavedFeatures(tmp_path), [0], None, ["hmm"])
     with pytest.raises(InputError, match=r"^fold 3, s0 by hmm: overflow$"):
         fold.run(tmp_path, lambda: None)

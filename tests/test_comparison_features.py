@@ -56,7 +56,9 @@ def test_a_file_without_features_is_named(clips, tmp_path, fault):
 
 def test_names_on_the_command_line(tmp_path):
     given = {"alignments": tmp_path, "options": {"sync": 0.5}, "backend": "numpy"}
-    assert features_named("aam", landmarks=tmp_path, **given) == AamFeatures(tmp_path, "numpy")
+    aam = features_named("aam", landmarks=tmp_path, **given | {"options": {"parameters": 4}})
+    assert aam == AamFeatures(tmp_path, "numpy", {"parameters": 4})
+    assert aam.facts() != AamFeatures(tmp_path, "numpy").facts()
     mmm = features_named("mmm", landmarks=None, **given)
     assert mmm == MmmFeatures(tmp_path, "numpy", Options(sync=0.5))
     assert features_named(str(tmp_path), landmarks=None, **given) == SavedFeatures(tmp_path)
@@ -101,10 +103,10 @@ def test_a_morphable_model_is_trained_on_the_folds_clips_and_shows_others(
 
 def test_features_of_an_appearance_model_are_shown_as_faces(world, clips, tmp_path):
     write_landmarks(world)
-    source = AamFeatures(world.alignments, "warp")
+    source = AamFeatures(world.alignments, "warp", {"parameters": 30})
     eye = source.learn(clips[:2], tmp_path, 0)
     y = eye.features(clips[2])
-    assert y.shape == (clips[2].info.frames, 32)
+    assert y.shape == (clips[2].info.frames, 30)
     np.testing.assert_array_equal(y, features(eye.aam, clips[2].path, world.alignments))
     eye.render(clips[2], y, tmp_path / "reality.mp4")
     eye.render(clips[2], np.zeros_like(y), tmp_path / "still.mp4")

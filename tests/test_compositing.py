@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from worlds import texture
 
-from mmmgpu.compositing import composite, composite_matched
+from mmmgpu.compositing import composite, composite_matched, looked_at
 from mmmgpu.regions import cover_mask, region_around
 from mmmgpu.tracks import Track
 
@@ -144,3 +144,15 @@ def test_no_more_grain_than_the_frame():
     rng = np.random.default_rng(0)
     got = composite_matched(under, own, COVER, np.eye(3), track(), REGION, rng)
     assert np.abs(got.astype(int) - under).max() <= 1
+
+
+@pytest.mark.parametrize("grow", [0.8, 1.0, 1.3])
+def test_what_is_not_looked_at_does_not_matter(grow):
+    """Behind a hard edge, between pixels, and with the picture made larger or smaller."""
+    hard = (COVER > 0.5).astype(np.float32)
+    shown = looked_at(hard)
+    assert hard.sum() < shown.sum() < shown.size
+    other = np.where(shown[..., None], image(), 1 - image()).astype(np.float32)
+    pose = shifted(0.37, 0.61) @ np.diag([grow, grow, 1.0])
+    seen, same = (composite(frame(), i, hard, pose, track(), REGION) for i in (image(), other))
+    np.testing.assert_array_equal(seen, same)

@@ -53,6 +53,24 @@ def test_equal_to_scipy_everywhere(number, c):
     assert_allclose(s(p), peer(p), rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("smoothing", [0.1, 8.0, 100])
+def test_smoothed_it_is_scipy_s_smoothed_one(smoothing):
+    a, b = marks()
+    s = rbf_correspondence(a, b, smoothing=smoothing)
+    width = np.sqrt(DEFAULT_C) / s.spacing
+    options = {"kernel": "gaussian", "epsilon": width, "degree": 1}
+    peer = RBFInterpolator(a, b, smoothing=smoothing, **options)
+    p = np.random.default_rng(1).uniform(-50, 300, (500, 2))
+    assert_allclose(s(p), peer(p), rtol=0, atol=1e-6)
+    assert np.abs(s(a) - b).max() > 0.01
+
+
+@pytest.mark.parametrize("smoothing", [-1, np.nan, 101])
+def test_a_smoothing_that_makes_no_map(smoothing):
+    with pytest.raises(InputError, match=f"^smoothing must be between 0 and 100, got {smoothing}"):
+        rbf_correspondence(*marks(), smoothing=smoothing)
+
+
 def test_equal_to_the_sum_term_by_term():
     s = rbf_correspondence(*marks())
     p = np.random.default_rng(1).uniform(-50, 300, (50, 2))

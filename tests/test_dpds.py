@@ -1,10 +1,13 @@
 import numpy as np
+import pytest
 from oracles_dynamics import dpds_least_squares, dpds_path, drawn_labels
 from scipy.stats import norm
 
-from mmmgpu.dpds import Dpds
+from mmmgpu import dpds
+from mmmgpu.dpds import Dpds, descend
 from mmmgpu.dynamics import trajectory
-from mmmgpu.labelled import LARGEST_A
+from mmmgpu.errors import UnsettledWarning
+from mmmgpu.labelled import LARGEST_A, check_labelled
 
 
 def drawn_dpds(rng, *, d=2, labels="abc"):
@@ -56,6 +59,38 @@ def test_no_better_parameters_are_near():
                 np.clip(other[name], -LARGEST_A, LARGEST_A) if name == "A" else other[name]
             )
             assert error(Dpds(**other)) > least
+
+
+def walks(rng, d=3):
+    labels = drawn_labels(rng, 8)
+    return check_labelled([rng.normal(size=(len(o), d)).cumsum(axis=0) for o in labels], labels)
+
+
+def test_the_descent_ends_where_a_span_of_iterations_gains_little(monkeypatch):
+    monkeypatch.setattr(dpds, "SPAN", 4)
+    monkeypatch.setattr(dpds, "TOLERANCE", 0.05)
+    _, history = descend(walks(np.random.default_rng(6)))
+    spans = history[:-4] - np.array(history[4:])
+    assert len(spans) > 4
+    assert spans[-1] < 0.05 <= spans[:-1].min()
+
+
+def test_what_descends_is_minus_log_likelihood():
+    data = walks(np.random.default_rng(6))
+    model, history = descend(data)
+    assert (np.diff(history) <= 0).all()
+    said = [[data.labels[p] for p in rows] for rows in data.rows]
+    e = [trajectory(model, own) - y for own, y in zip(said, data.y, strict=True)]
+    share = (np.concatenate(e) ** 2).mean(axis=0) / data.frames.var(axis=0)
+    np.testing.assert_allclose(history[-1], np.log(share).mean() / 2, atol=1e-5)
+
+
+def test_a_descent_that_is_cut_short_says_so():
+    data = walks(np.random.default_rng(5))
+    with pytest.warns(UnsettledWarning, match="dpds: still gaining after 4 iterations"):
+        model, history = descend(data, iterations=4)
+    assert len(history) == 5
+    assert np.isfinite(model.A).all()
 
 
 def test_a_stays_below_one_where_the_data_run_away():

@@ -19,10 +19,10 @@ from mmmgpu.dynamics import (
     trajectory,
 )
 from mmmgpu.errors import InputError
-from mmmgpu.slds import Slds
+from mmmgpu.slds import FullSlds
 
 EVERY = pytest.mark.parametrize("name", MODELS)
-STREAMING = pytest.mark.parametrize("name", ["hmm", "slds", "dpds"])
+STREAMING = pytest.mark.parametrize("name", ["hmm", "slds", "dpds", "slds-full"])
 
 
 def corpus(seed=0, number=4, d=2):
@@ -39,6 +39,7 @@ def fitted():
 
 @EVERY
 def test_one_frame_comes_for_each_label(fitted, name):
+    assert type(fitted[name]) is MODELS[name]
     y = trajectory(fitted[name], ["AA", "M", "M", "S"])
     assert y.shape == (4, 2)
     assert y.dtype == np.float64
@@ -55,9 +56,21 @@ def test_the_same_twice_is_the_same_bits_and_the_data_stay(fitted, name):
     np.testing.assert_array_equal(np.concatenate(y), np.concatenate(before))
 
 
+@EVERY
+def test_features_in_other_units_make_the_same_movement(fitted, name):
+    y, labels = corpus()
+    said, unit = ["SIL", "AA", "M", "M", "S"], 1000.0
+    other = MODELS[name].fit([unit * one for one in y], labels)
+    made = trajectory(fitted[name], said)
+    np.testing.assert_allclose(trajectory(other, said), unit * made, rtol=1e-5, atol=1e-5 * unit)
+    if isinstance(other, Generative):
+        value = fitted[name].log_likelihood(y[0], labels[0]) - np.log(unit) * y[0].size
+        np.testing.assert_allclose(other.log_likelihood(unit * y[0], labels[0]), value, rtol=1e-5)
+
+
 def test_comparable_models_are_distributions_and_the_others_say_so(fitted):
     comparable = {name for name, model in fitted.items() if model.comparable}
-    assert comparable == {"hmm", "slds", "dpds"}
+    assert comparable == {"hmm", "slds", "dpds", "slds-full"}
     assert {name for name, model in fitted.items() if isinstance(model, Generative)} == comparable
 
 
@@ -154,7 +167,7 @@ def test_a_phone_of_one_frame_and_features_that_do_not_move_can_be_fitted(name):
 def test_full_covariances_of_singular_features_are_kept_regular():
     y, labels = corpus()
     y = [np.column_stack([one, np.zeros(len(one)), one[:, 0]]) for one in y]
-    model = Slds.fit(y, labels, full=True)
+    model = FullSlds.fit(y, labels)
     for covariance in (model.Sigma, model.Q, model.R):
         assert (np.linalg.eigvalsh(covariance) > 0).all()
     assert np.isfinite(trajectory(model, labels[0])).all()
@@ -181,12 +194,6 @@ def test_a_model_comes_back_bit_for_bit(fitted, tmp_path, name):
         assert np.asarray(got).dtype == np.asarray(want).dtype
     save_dynamics(again, tmp_path / "b.model")
     assert (tmp_path / "b.model").read_bytes() == (tmp_path / "a ü.model").read_bytes()
-
-
-def test_full_covariances_come_back_too(tmp_path):
-    model = Slds.fit(*corpus(), full=True)
-    save_dynamics(model, tmp_path / "a")
-    np.testing.assert_array_equal(load_dynamics(tmp_path / "a").Q, model.Q)
 
 
 @pytest.fixture(scope="module")
@@ -260,7 +267,7 @@ def test_a_bad_file_is_said_on_one_line(data, tmp_path, fault):
 
 
 def test_a_singular_covariance_in_a_file_is_refused(tmp_path):
-    model = Slds.fit(*corpus(), full=True)
+    model = FullSlds.fit(*corpus())
     model.Q[0] = 1
     save_dynamics(model, tmp_path / "bad")
     with pytest.raises(InputError, match="bad: tensor Q must be positive definite"):

@@ -1,14 +1,17 @@
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
 from oracles_adaptation import dense_follow, regression_slope
+from scipy.linalg import block_diag
 
 from mmmgpu.errors import InputError
 from mmmgpu.gdlr import (
+    DAMPINGS,
     RULES,
+    SHAPES,
     Descent,
-    class_curvature,
+    curvature_roots,
     descend_means,
     error_and_slope,
     gain,
@@ -56,9 +59,20 @@ def dense_arguments(models, clips):
     )
 
 
-def descend(system, mean, z, rule="bounded", *, rate=1.0, iterations=30, class_of=CLASS_OF):
-    steps = rate * RULES[rule].steps(system, mean, class_of)
-    return descend_means(system, mean, z, class_of, steps=steps, iterations=iterations)
+def descend(
+    system, mean, z, rule="bounded", *, shape="full", rate=1.0, iterations=30, class_of=CLASS_OF
+):
+    """Of the first metric of that shape."""
+    metric = next(
+        own
+        for constants, own in RULES[rule].metrics(system, mean, class_of)
+        if constants.get("shape", shape) == shape
+    )
+    return descend_means(system, mean, z, class_of, metric=rate * metric, iterations=iterations)
+
+
+def roots_of(system, mean, class_of=CLASS_OF, *, shape="full", damping=1.0):
+    return curvature_roots(system.line.phone, mean, class_of, shape=shape, damping=damping)
 
 
 def random_regressions(rng):
@@ -125,28 +139,52 @@ def test_an_iteration_is_equation_17():
     assert len(path) == 3
 
 
-def test_curvature_is_that_of_free_trajectories():
+def test_roots_are_of_the_curvature_of_free_trajectories():
     """Were y = R_g xi_t, the Hessian of E in a row of R_g would be 2 sum xi xi'."""
     rng = np.random.default_rng(4)
     mean = rng.normal(size=(4, 2))
-    phone = np.array([0, 0, 2, 1, 1, 1])
-    curvature = class_curvature(phone, mean, np.array([0, 1, 0, 2]))
+    phone, class_of = np.array([0, 0, 2, 1, 1, 1]), np.array([0, 1, 0, 2])
+    full, diagonal = (
+        curvature_roots(phone, mean, class_of, shape=shape, damping=0.3) for shape in SHAPES[::-1]
+    )
     for g, rows in ((0, [0, 0, 2]), (1, [1, 1, 1])):
-        total = sum(np.outer(np.r_[1, mean[p]], np.r_[1, mean[p]]) for p in rows)
-        np.testing.assert_allclose(curvature[g], 2 * np.linalg.eigvalsh(total)[-1], rtol=1e-12)
-    assert curvature[2] == 0
+        H = 0.6 * np.eye(3)
+        for p in rows:
+            H += 2 * np.outer(np.r_[1, mean[p]], np.r_[1, mean[p]])
+        for j in (0, 1):
+            np.testing.assert_allclose(full[g, j] @ full[g, j] @ H, np.eye(3), atol=1e-12)
+            free, held = [0, j + 1], 2 - j
+            inverse = (diagonal[g, j] @ diagonal[g, j])[np.ix_(free, free)]
+            np.testing.assert_allclose(inverse @ H[np.ix_(free, free)], np.eye(2), atol=1e-12)
+            assert not diagonal[g, j, held].any()
+            assert not diagonal[g, j, :, held].any()
+    assert not full[2].any()
+    assert not diagonal[2].any()
 
 
-def test_steps_are_by_the_curvature_and_never_longer_than_by_that_bound():
+def test_the_diagonal_shape_scales_and_shifts_each_dimension():
+    rng = np.random.default_rng(12)
+    models, clips = random_models(rng), corpus(rng)
+    system, z = system_of(models, clips)
+    moved = descend(system, models.mean, z, shape="diagonal", class_of=np.zeros(4, int))[-1]
+    for before, after in zip(models.mean.T, moved.T, strict=True):
+        np.testing.assert_allclose(after, np.polyval(np.polyfit(before, after, 1), before))
+        assert np.abs(after - before).max() > 1e-2
+
+
+def test_metrics_are_by_the_curvature_and_never_longer_than_by_that_bound():
     models, system, _ = amplifying()
-    L = class_curvature(system.line.phone, models.mean, CLASS_OF)
-    c = gain(system, models.mean, CLASS_OF, 1 / L)
-    assert (c > 2).all()
-    steps = RULES["bounded"].steps(system, models.mean, CLASS_OF)
-    np.testing.assert_allclose(steps, 1 / (L[:, None] * c), rtol=1e-12)
     calm = factor_system(system.line, models, np.full(3, 1e-9))  # nothing is smoothed: c = 1
-    steps = RULES["bounded"].steps(calm, models.mean, CLASS_OF)
-    np.testing.assert_allclose(steps, np.tile(1 / L[:, None], 3), rtol=1e-6)
+    found = list(RULES["bounded"].metrics(system, models.mean, CLASS_OF))
+    assert [tuple(constants.values()) for constants, _ in found] == list(product(SHAPES, DAMPINGS))
+    for constants, metric in found:
+        roots = roots_of(system, models.mean, **constants)
+        c = gain(system, models.mean, CLASS_OF, roots)
+        assert (c > 2).all()
+        np.testing.assert_allclose(metric * c[:, None, None], roots @ roots, rtol=1e-12)
+    for constants, metric in RULES["bounded"].metrics(calm, models.mean, CLASS_OF):
+        roots = roots_of(system, models.mean, **constants)
+        np.testing.assert_allclose(metric, roots @ roots, rtol=1e-6)
 
 
 def many_clips(rng, n_clips=5, n_dims=6):
@@ -165,15 +203,17 @@ def errors(system, path, z):
 
 
 @pytest.mark.parametrize("kind", DENSE)
-@pytest.mark.parametrize("rate", RULES["bounded"].rates)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("rate", [*RULES["bounded"].rates, 1.0])
 @pytest.mark.parametrize("smoothness", [0.01, 1.0, 100.0])
-def test_training_error_falls_with_every_iteration(kind, rate, smoothness):
+def test_training_error_falls_with_every_iteration(kind, rate, shape, smoothness):
     rng = np.random.default_rng(5)
     models, clips = random_models(rng, kind, n_dims=6), many_clips(rng)
     system, z = system_of(models, clips, np.full(6, smoothness))
-    curve = errors(system, descend(system, models.mean, z, rate=rate), z)
+    curve = errors(system, descend(system, models.mean, z, shape=shape, rate=rate), z)
     assert len(curve) == 31
-    assert (np.diff(curve) < 0).all()
+    at_the_end = curve[1:] <= curve[-1] * (1 + 1e-12)  # as far as it goes, but for rounding
+    assert ((np.diff(curve) < 0) | at_the_end).all()
     assert curve[-1] < 0.8 * curve[0]
 
 
@@ -189,33 +229,33 @@ def amplifying():
 def test_training_error_falls_where_smoothing_amplifies_and_the_plain_bound_does_not_hold():
     models, system, z = amplifying()
     assert (np.diff(errors(system, descend(system, models.mean, z), z)) < 0).all()
-    L = class_curvature(system.line.phone, models.mean, CLASS_OF)
-    plain = np.tile(1 / L[:, None], 3)
-    path = descend_means(system, models.mean, z, CLASS_OF, steps=plain)
+    roots = roots_of(system, models.mean)
+    path = descend_means(system, models.mean, z, CLASS_OF, metric=roots @ roots)
     assert (np.diff(errors(system, path, z)) > 0).any()
 
 
 @pytest.mark.parametrize("kind", DENSE)
-def test_gain_is_the_largest_curvature_in_units_of_that_bound(kind):
+@pytest.mark.parametrize("shape", SHAPES)
+def test_gain_is_the_largest_curvature_in_units_of_that_bound(kind, shape):
     """The Hessian entry by entry: the slope at each unit matrix with nothing to meet."""
     rng = np.random.default_rng(10)
     models, clips = random_models(rng, kind), many_clips(rng, n_clips=2, n_dims=2)
     system, z = system_of(models, clips)
-    L = class_curvature(system.line.phone, models.mean, CLASS_OF)
+    roots = roots_of(system, models.mean, shape=shape)
     columns = []
     for entry in np.ndindex(2, 2, 3):
         unit = np.zeros((2, 2, 3))
         unit[entry] = 1
         columns.append(error_and_slope(system, unit, models.mean, 0 * z, CLASS_OF)[1].ravel())
-    root = np.repeat(1 / np.sqrt(L), 6)
-    hessian = root[:, None] * np.array(columns).T * root
+    root = block_diag(*roots.reshape(4, 3, 3))
+    hessian = root @ np.array(columns).T @ root
     row = np.tile(np.repeat([0, 1], 3), 2)  # dimension of each entry
     if kind == "full":
         want = [np.linalg.eigvalsh(hessian)[-1]]
     else:
         np.testing.assert_allclose(hessian[row == 0][:, row == 1], 0, atol=1e-12)
         want = [np.linalg.eigvalsh(hessian[row == j][:, row == j])[-1] for j in (0, 1)]
-    found = gain(system, models.mean, CLASS_OF, 1 / L)
+    found = gain(system, models.mean, CLASS_OF, roots)
     assert found.shape == (len(want),)
     assert (found <= want * np.array(1 + 1e-12)).all()
     assert (found > 0.75 * np.array(want)).all()

@@ -1,15 +1,17 @@
 import os
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hmms import LEXICON, RATE, SENTENCES, utter
+from scipy.stats import norm
 
 from mmmgpu import hmm_aligner, hmm_training
 from mmmgpu.alignments import read_alignment
 from mmmgpu.errors import InputError
-from mmmgpu.hmm_aligner import align, make_recording, train_hmms
+from mmmgpu.hmm_aligner import align, make_recording, misfit, suspects, train_hmms
 from mmmgpu.lexicons import look_up, read_lexicon
 from mmmgpu.phone_networks import BREATH
 from mmmgpu.phones import SIL
@@ -98,6 +100,54 @@ def test_the_same_bits_again_and_after_an_interruption(foreign, trained, tmp_pat
     assert sum(rest) == sum(hmm_training.ROUNDS) * len(foreign[0])
     assert again.log_likelihoods == trained.log_likelihoods
     assert same(again.hmms, trained.hmms)
+
+
+def test_a_misfit_is_how_much_better_other_phones_explain_the_frames(lexicon, trained):
+    samples, _ = utter("Mása so", np.random.default_rng(6), pause=0.5)
+    words = look_up("Osim so", lexicon, "a.dict")  # not what is said
+    recording = make_recording(samples, RATE, words)
+    found, hmms = align(trained.hmms, recording), trained.hmms
+    gaps = []
+    for t, x in enumerate(recording.features):
+        likely = {
+            label: max(
+                np.logaddexp.reduce(
+                    [
+                        np.log(w) + norm(m, np.sqrt(v)).logpdf(x).sum()
+                        for w, m, v in zip(
+                            hmms.weights[q], hmms.means[q], hmms.variances[q], strict=True
+                        )
+                        if w > 0
+                    ]
+                )
+                for q in states
+            )
+            for label, states in hmms.states.items()
+        }
+        (own,) = [p.label for p in found.phones if p.start <= (t + 0.5) / 100 < p.end]
+        if own != SIL:
+            gaps.append(max(likely.values()) - likely[own])
+    assert 10 < len(gaps) < len(recording.features) - 10  # the others are silent
+    assert np.mean(gaps) > 1
+    np.testing.assert_allclose(misfit(hmms, recording, found), np.mean(gaps), rtol=1e-6)
+
+
+def test_other_words_than_are_said_fit_badly(foreign, trained):
+    right, wrong = foreign[0][1], foreign[0][5]
+    forced = replace(right, words=wrong.words)
+    good = misfit(trained.hmms, right, align(trained.hmms, right))
+    bad = misfit(trained.hmms, forced, align(trained.hmms, forced))
+    assert good < 2
+    assert bad > good + 10
+
+
+def test_a_clip_is_suspect_if_it_is_far_from_all_others():
+    usual = [0.9, 1.0, 1.1, 1.2, 0.8, 1.3, 0.7]
+    assert not suspects([*usual, 1.9]).any()
+    assert suspects([*usual, 3.0]).tolist() == [False] * 7 + [True]
+    assert not suspects([*usual, -3.0]).any()
+    assert not suspects([*usual[:6], 3.0]).any()  # too few to say what is usual
+    assert not suspects([1.0] * 9).any()
 
 
 def test_a_breath_in_a_pause_is_told_from_silence(lexicon):

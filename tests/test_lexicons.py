@@ -13,6 +13,8 @@ Straße S t r a: s @
 don't D OW1 N T
 e-mail IY1 M EY2 L
 mail M EY1 L
+a.m. EY1 EH2 M
+A EY1
 
 'em AH0 M
 2 T UW1
@@ -30,7 +32,7 @@ def test_words_and_their_pronunciations(lexicon):
     assert lexicon["hello"] == (("HH", "AH", "L", "OW"), ("HH", "EH", "L", "OW"))
     assert lexicon["straße"] == (("S", "t", "r", "a:", "s", "@"),)
     assert set(lexicon) == {
-        *("hello", "straße", "don't", "e-mail", "mail", "'em", "2", "हिन्दी"),
+        *("hello", "straße", "don't", "e-mail", "mail", "a.m.", "a", "'em", "2", "हिन्दी"),
     }
 
 
@@ -39,6 +41,8 @@ def test_words_and_their_pronunciations(lexicon):
     [
         ("Hello, “HELLO” — hello!", "hello hello hello"),
         ("Don\u2019t e-mail 'em.", "don't e-mail 'em"),
+        ("A 'e-mail' \u2018em, 2 A.M.", "a e-mail 'em 2 a.m."),
+        ("हिन्दी! हिन्दी-mail", "हिन्दी हिन्दी mail"),
         ("mail-mail/2", "mail mail 2"),
         ("STRASSE", None),
         ("Stra\u00dfe हिन्दी (2)", "straße हिन्दी 2"),

@@ -106,8 +106,8 @@ def test_phones_that_were_never_seen_are_spoken(s1, tmp_path):
 
 def test_larger_pictures_go_the_same_way(tmp_path):
     every = clips("grid-s4")
-    training = [clip for i, clip in enumerate(every) if i % 4][:4]
-    model = train(training, every[0].parent, tmp_path / "s4.mmm", options=Options(prototypes=30))
+    training = [clip for i, clip in enumerate(every) if i % 4][:3]
+    model = train(training, every[0].parent, tmp_path / "s4.mmm", options=Options(prototypes=24))
     assert model.frame_size == (720, 576)
     assert not model.notes["skipped"]
     clip, out = every[0], tmp_path / "held-out.mkv"
@@ -147,9 +147,8 @@ def test_a_second_person_from_one_clip(s1, tmp_path):
     assert probe(tmp_path / "spoken.mp4").frames > 10
 
 
-@pytest.mark.parametrize("number", [0, 5])
-def test_one_clip_of_a_person_is_enough_to_begin(number, tmp_path):
-    clip = clips("grid-others")[number]
+def test_one_clip_of_a_person_is_enough_to_begin(tmp_path):
+    clip = clips("grid-others")[0]
     model = train([clip], clip.parent, tmp_path / "one.mmm", options=Options(prototypes=20))
     speak(model, say("Hello again."), tmp_path / "spoken.mp4")
     assert probe(tmp_path / "spoken.mp4").frames > 10

@@ -26,6 +26,7 @@ from mmmgpu.videos import VideoInfo, probe
     [
         ("a.wav", "pcm_u8", "u8", 1 / 128),
         ("a.wav", "pcm_s16le", "s16", 1e-4),
+        ("a.wav", "pcm_s24le", "s32", 1e-6),
         ("a.wav", "pcm_s32le", "s32", 1e-6),
         ("a.wav", "pcm_f32le", "flt", 1e-7),
         ("a.wav", "pcm_f64le", "dbl", 1e-7),

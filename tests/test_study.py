@@ -97,11 +97,24 @@ def test_create_with_another_real_condition_and_cut_clips(mmmgpu, clips, tmp_pat
     shutil.rmtree(changed / "reality")
     write_clip(changed, "slds", SENTENCES[0], frames=6)
     refused = mmmgpu("create", changed, "--out", tmp_path / "s")
-    assert_refused(refused, "no folder 'reality'", "--real", "brand, dpds, slds")
+    assert_refused(refused, "'reality' is none", "--real", "brand, dpds, slds")
     args = ("create", changed, "--out", tmp_path / "s", "--real", "dpds")
     assert_refused(mmmgpu(*args), "--cut", "6 frames")
     assert not (tmp_path / "s").exists()
     assert mmmgpu(*args, "--cut").status == 0
+
+
+def test_create_takes_the_conditions_that_are_chosen(mmmgpu, clips, tmp_path):
+    args = ("create", clips, "--out", tmp_path / "s", "--conditions")
+    refused = mmmgpu(*args, "reality,hmm")
+    assert_refused(refused, clips, "no folder 'hmm'", "brand, dpds, reality, slds")
+    assert_refused(mmmgpu(*args, "reality"), "two conditions at least")
+    assert_refused(mmmgpu(*args, "brand,dpds"), "'reality' is none", "brand, dpds")
+    assert mmmgpu(*args, "reality, dpds").status == 0
+    plan = read_study(tmp_path / "s")
+    assert plan.conditions == ("dpds", "reality")
+    assert {clip.condition for clip in plan.clips} == {"dpds", "reality", None}
+    assert all(sum(not p.is_check for p in x.pairs) == 2 for x in plan.participants)
 
 
 BAD_INTRODUCTIONS = {"empty": b" \n", "not UTF-8": b"\xff\xfe", "missing": None}

@@ -69,7 +69,7 @@ def test_nothing_is_left_when_a_clip_fails(clips, tmp_path, monkeypatch):
 
 
 def test_no_real_condition_is_refused_with_those_there_are(clips, tmp_path):
-    with pytest.raises(InputError, match=r"no folder 'truth'.*--real.*brand, dpds, reality, slds"):
+    with pytest.raises(InputError, match=r"'truth' is none.*--real.*brand, dpds, reality, slds"):
         create_study(clips, tmp_path / "s", options=StudyOptions(real="truth"))
 
 

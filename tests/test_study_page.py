@@ -292,14 +292,25 @@ def test_of_two_windows_the_first_answer_counts(visit, site):
     assert site.choices() == ["left"]
 
 
-def test_a_double_click_is_one_answer(visit, site):
+TWICE = {
+    "click": "form.querySelector('#confirm').click(); form.querySelector('#confirm').click()",
+    "submit": "form.requestSubmit(); form.requestSubmit()",  # as Enter does, without the button
+}
+
+
+@pytest.mark.parametrize("way", TWICE)
+def test_a_double_click_is_one_answer(visit, site, way):
     page = visit()
     page.begin()
     page.watch()
     page.choose("left")
-    page.tab.dblclick("#confirm")
+    sent = []
+    page.tab.on("request", lambda r: sent.append(r.url) if r.method == "POST" else None)
+    page.tab.evaluate(f"() => {{ const form = document.querySelector('#pair'); {TWICE[way]} }}")
     page.shown(2)
     page.watch()
+    assert len(sent) == 1
+    assert page.message() == ""
     assert site.choices() == ["left"]
 
 

@@ -48,6 +48,45 @@ def test_a_folder_that_cannot_be_written_is_refused(found, tmp_path):
         write_tables(found, tmp_path / "file")
 
 
+def rows_shown(text):
+    """The cells of each line of the tables."""
+    lines = [line for line in text.splitlines() if line.startswith("│")]
+    return [[cell.strip() for cell in line.strip("│").split("│")] for line in lines]
+
+
+def test_every_number_is_shown_in_its_place(found, capsys):
+    first = found["table"][0] | {"p": 0.011, "p_holm": 0.022, "p_people": 0.033}
+    best = {"condition": "dpds", "theta": 1.25, "low": 0.5, "high": 2.0}
+    people = found["participants"] | {"failed_checks": [3, 5], "excluded": [3, 5]}
+    chosen = {"lower": 7, "higher": 2, "p": 0.18}
+    changed = {
+        "table": [first | {"share_a": 0.25, "low": 0.1, "high": 0.6}],
+        "scale": {"conditions": [best], "order": "dpds", "reason": None},
+        "sides": {"left": 7, "undecided": 1, "right": 4, "p": 0.55},
+        "participants": people,
+        "errors": {"L1": {"means": {"brand": None, "dpds": 1.5}, "chosen": chosen}},
+    }
+    show_results(found | changed)
+    out = capsys.readouterr().out
+    rows = rows_shown(out)
+    counts = [str(first[name]) for name in ("a", "prefer_a", "undecided", "prefer_b", "b")]
+    tests = [first["a"], first["b"], "25% (10% .. 60%)", "0.011", "0.022", "0.033"]
+    assert rows[:2] == [counts, tests]
+    assert rows[2:] == [["dpds", "1.25", "0.50 .. 2.00"], ["brand", "-"], ["dpds", "1.5"]]
+    assert "left 7, right 4 times (p 0.55)" in out
+    assert "failed attention checks: 3, 5; left out" in out
+    assert "the clip of lower L1 was chosen 7 times, the other 2 (p 0.18)" in out
+
+
+def test_that_there_is_no_ranking_is_said_with_the_reason(found, capsys):
+    none = {"conditions": None, "order": None, "reason": "dpds always won"}
+    show_results(found | {"scale": none})
+    out = capsys.readouterr().out
+    assert "no ranking: dpds always won" in out
+    assert "failed attention checks: nobody\n" in out
+    assert "Bradley-Terry" not in out
+
+
 def test_results_are_shown(found, capsys):
     show_results(found)
     shown = capsys.readouterr().out

@@ -110,10 +110,11 @@ def test_textures_that_cannot_be_seen_cost_no_brightness(basis):
     np.testing.assert_array_equal(made, wanted)
 
 
-def test_pictures_stay_in_range(basis):
+@pytest.mark.parametrize("name", ALL)
+def test_pictures_stay_in_range(basis, name):
     bright = replace(basis, images=np.ones_like(basis.images))
     alpha, beta = coordinates(basis, 3)
-    for image in synthesize(bright, 3 * alpha, beta, backend="numpy"):
+    for image in synthesize(bright, 3 * alpha, beta, backend=name):
         np.testing.assert_allclose(image, 1, rtol=0, atol=1e-5)
         assert image.max() <= 1
 

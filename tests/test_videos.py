@@ -9,7 +9,7 @@ from media import cut, encode, encode_sound, grey_levels, set_display_matrix, st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu.errors import InputError
-from mmmgpu.videos import probe, read_frames
+from mmmgpu.videos import probe, read_chosen_frames, read_frames
 
 NTSC = Fraction(30000, 1001)
 
@@ -63,6 +63,13 @@ def test_a_part_is_that_part(tmp_path):
     assert which(read_frames(path, stop=3), 12) == [0, 1, 2]
     assert list(read_frames(path, start=5, stop=5)) == []
     assert list(read_frames(path, start=30)) == []
+
+
+def test_chosen_frames_are_those(tmp_path):
+    path = encode(tmp_path / "a.mkv", grey_levels(12))
+    assert which(read_chosen_frames(path, [0, 3, 4, 11]), 12) == [0, 3, 4, 11]
+    assert which(read_chosen_frames(path, [5]), 12) == [5]
+    assert list(read_chosen_frames(path, [])) == []
 
 
 def test_reading_stops_early_without_a_file_left_open(tmp_path):

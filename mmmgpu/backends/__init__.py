@@ -61,8 +61,8 @@ class Backend(Protocol):
     def hold_prototypes(self, images: F32, flows: F32, hole: float, /) -> Any:
         """NumPy (M, H, W, 3) in [0, 1], (M, H, W, 2): all that stays the same, on the device.
 
-        A pixel that receives less weight than `hole` in one of the two warps of CE05, Eq. 2, is
-        filled.
+        A pixel that receives less weight than `hole`, which is below 1, in one of the two warps of
+        CE05, Eq. 2, is filled.
         """
 
     def move_prototypes(self, held: Any, flow: Any, used: Any, scale: Any, /) -> Any:

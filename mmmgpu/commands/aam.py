@@ -28,13 +28,11 @@ def aam(
         Path, typer.Option("--out", metavar="AAM", help="Model to write, by custom NAME.aam.")
     ],
     parameters: Annotated[
-        int,
+        int | None,
         typer.Option(
-            metavar="N",
-            help="How many features a frame has.",
-            default_factory=LibraryDefault(*_FIT, "parameters"),
+            metavar="N", help="How many features a frame has: 32, unless --variance is given."
         ),
-    ],
+    ] = None,
     variance: Annotated[
         float | None,
         typer.Option(

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -197,7 +198,7 @@ def _align_by_hmms(
     Until that is done its steps lie in `folder`.
     """
     from mmmgpu.checkpoints import fingerprint, open_checkpoints
-    from mmmgpu.hmm_aligner import align, make_recording, train_hmms
+    from mmmgpu.hmm_aligner import align, make_recording, misfit, train_hmms
     from mmmgpu.hmm_training import ROUNDS
     from mmmgpu.progress import progress, progress_bar
 
@@ -215,9 +216,26 @@ def _align_by_hmms(
     with progress_bar(sum(ROUNDS) * len(recordings), "train phone models") as advance:
         trained = train_hmms([*recordings.values()], breath=breath, folder=steps, advance=advance)
     for job, recording in progress(recordings.items(), "align clips"):
-        results[job] = job.write(align(trained.hmms, recording))
+        found = align(trained.hmms, recording)
+        results[job] = job.write(found) | {"misfit": misfit(trained.hmms, recording, found)}
+    _warn_of_suspects([results[job] for job in recordings])
     shutil.rmtree(folder)
     return [results[job] for job in jobs], {"training": trained.facts}
+
+
+def _warn_of_suspects(results: Sequence[Result]) -> None:
+    """One line for each clip whose sound fits its transcript far worse than the others' do."""
+    from mmmgpu.hmm_aligner import suspects
+
+    misfits = [one["misfit"] for one in results]
+    for one, is_suspect in zip(results, suspects(misfits), strict=True):
+        one["suspect"] = bool(is_suspect)
+        if is_suspect:
+            say(
+                f"warning: {one['clip']}: the sound fits its transcript far worse than in other "
+                f"clips (misfit {one['misfit']:.1f}, median {median(misfits):.1f}); is that what "
+                "is said?"
+            )
 
 
 def _words_by(dictionary: Path | None) -> "Callable[[str], list[Spoken]]":

@@ -28,14 +28,19 @@ class LibraryDefault:
         return str(self())  # shown by --help
 
 
-def parse_box(text: str) -> Box:
+def parse_box(text: str, option: str = "--region") -> Box:
     """X,Y,W,H as four whole numbers; a usage error, if it is something else."""
     try:
         x, y, width, height = (int(part) for part in text.split(","))
     except ValueError:
         message = f"{text!r} must be four whole numbers, as in 100,150,80,60"
-        raise typer.BadParameter(message, param_hint="--region") from None
+        raise typer.BadParameter(message, param_hint=option) from None
     return x, y, width, height
+
+
+def split_names(text: str) -> tuple[str, ...]:
+    """The names in "A,B,..."."""
+    return tuple(name.strip() for name in text.split(","))
 
 
 ModelFile = Annotated[

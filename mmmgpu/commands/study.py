@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mmmgpu.commands.endings import guarded, say
-from mmmgpu.commands.options import Json, LibraryDefault
+from mmmgpu.commands.options import Json, LibraryDefault, split_names
 from mmmgpu.commands.places import require_output, write_results
 from mmmgpu.commands.study_tables import show_results, write_tables
 from mmmgpu.web_pages import LOOPBACK
@@ -47,6 +47,12 @@ def create(
     ],
     *,
     out: Annotated[Path, typer.Option("--out", metavar="STUDY", help="Study folder to make.")],
+    conditions: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,...", help="Folders of DIR that are taken; without it all of them."
+        ),
+    ] = None,
     real: Annotated[
         str,
         typer.Option(
@@ -111,6 +117,7 @@ def create(
     from mmmgpu.study_creation import StudyOptions, create_study
 
     options = StudyOptions(
+        conditions=None if conditions is None else split_names(conditions),
         real=real,
         participants=participants,
         pairs=pairs,

@@ -10,13 +10,16 @@ if TYPE_CHECKING:
     from mmmgpu.trajectory_training import TrainedStream
 
 
-def show_table(title: str, rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> None:
-    """Print a table: a title, the names of the columns if there are any, and rows."""
+def show_table(
+    title: str, rows: Iterable[Sequence[object]], header: Sequence[str] = (), legend: str = ""
+) -> None:
+    """Print a table: a title, the names of the columns if there are any, rows, and a legend."""
     from rich.console import Console
     from rich.table import Table
 
     lines = [[f"{x:.4g}" if isinstance(x, float) else str(x) for x in row] for row in rows]
     table = Table(title=title, title_justify="left", show_header=bool(header))
+    table.caption, table.caption_justify = legend or None, "left"
     names = header or [""] * len(lines[0])
     for name in names:
         table.add_column(name, overflow="fold")
