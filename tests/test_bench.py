@@ -240,7 +240,13 @@ def test_a_profile_names_the_innermost_function_of_ours():
 
 
 def test_a_thread_that_waits_is_not_in_the_profile():
-    thread = threading.Thread(target=(event := threading.Event()).wait)
+    event = threading.Event()
+
+    def items():
+        event.wait()
+        yield 1
+
+    thread = threading.Thread(target=lambda: list(progress(items(), "x", quiet=True)), daemon=True)
     thread.start()
     while sys._current_frames()[thread.ident].f_code.co_name != "wait":
         time.sleep(0.001)
