@@ -154,7 +154,18 @@ def test_a_killed_comparison_goes_on_and_ends_in_the_same(tmp_path, monkeypatch)
     assert done == [1, 2]
 
 
-def test_folds_that_are_done_are_counted_and_other_features_begin_again(tmp_path, monkeypatch):
+def other_features(clips, folder):
+    np.savez(folder / "s0.npz", features=np.load(folder / "s0.npz")["features"] + 1)
+
+
+def other_phones(clips, folder):
+    said = ["SIL", *["M"] * (len(clips[0].labels) - 1)]
+    clips[0] = sentence(folder, "again", said, np.load(folder / "s0.npz")["features"])
+    clips[0] = replace(clips[0], path=folder / "s0.mkv")
+
+
+@pytest.mark.parametrize("change", [other_features, other_phones])
+def test_folds_that_are_done_are_counted_and_other_data_begin_again(tmp_path, monkeypatch, change):
     clips, done = corpus(tmp_path), run_here(monkeypatch)
     options, saved = CompareOptions(folds=3, models=FEW), SavedFeatures(tmp_path)
     keep, counted = comparison.write_step, []
@@ -177,7 +188,7 @@ def test_folds_that_are_done_are_counted_and_other_features_begin_again(tmp_path
                 compare(clips, saved, tmp_path / "work", options=options)
     assert done == [0]
     assert counted == [6, 0, 1, 1, 1, 1, 6, 2, 1, 1]  # two models of the first fold were done
-    np.savez(tmp_path / "s0.npz", features=np.load(tmp_path / "s0.npz")["features"] + 1)
+    change(clips, tmp_path)
     compare(clips, saved, tmp_path / "work", options=options)
     assert done == [0, 0, 1, 2]
 

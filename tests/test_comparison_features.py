@@ -99,6 +99,15 @@ def test_a_morphable_model_is_trained_on_the_folds_clips_and_shows_others(
     shown, real = mouths(tmp_path / "reality.mp4"), mouths(clips[2].path)
     assert np.abs(shown - real).mean() < 0.8 * np.abs(mouths(tmp_path / "still.mp4") - real).mean()
     assert source.facts() != MmmFeatures(world.alignments, "warp").facts()
+    drawn = []
+    monkeypatch.setattr("mmmgpu.comparison_features._write", lambda *given: None)
+    monkeypatch.setattr(
+        "mmmgpu.comparison_features.reconstructed_frames",
+        lambda model, path, analysed, *, backend: drawn.append(analysed),
+    )
+    eye.render(clips[2], y, tmp_path / "none.mp4")
+    np.testing.assert_array_equal(drawn[0].alpha, seen.alpha)
+    np.testing.assert_allclose(drawn[0].beta, seen.beta, atol=1e-9)
 
 
 def test_features_of_an_appearance_model_are_shown_as_faces(world, clips, tmp_path):
