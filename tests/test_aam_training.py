@@ -10,6 +10,7 @@ from mmmgpu import aam_training
 from mmmgpu.aam_training import fit_aam
 from mmmgpu.appearances import aligned, fit_light, read_texture, reduce_picture, take_light_off
 from mmmgpu.backends import get_backend
+from mmmgpu.components import gram_of, principal_components
 from mmmgpu.errors import InputError
 
 
@@ -163,6 +164,14 @@ def spoilt(drawn, folder, change):
     change(points)
     np.savez(folder / f"{clip.stem}.npz", points=points)
     return clip
+
+
+def test_more_parameters_than_the_frames_have_ways_to_vary_are_refused():
+    rows = np.random.default_rng(0).normal(size=(9, 3)) @ np.eye(3, 8)
+    found = principal_components(gram_of(rows))
+    with pytest.raises(InputError, match="vary in 3 ways only, too few for 4 parameters"):
+        aam_training._count(found, 4, None)
+    assert aam_training._count(found, 3, None) == 3
 
 
 def turn_over(points):
