@@ -35,7 +35,10 @@ def model_works(backends, peers):
 
 
 def matching_work(backends, prototypes=46, frames=450, side=128):
-    """Eq. 7: the flows of all frames compared with those of all prototypes, where S has them."""
+    """Eq. 7: the flows of all frames read along S and compared with those of all prototypes.
+
+    Their principal directions, which calibration needs, are found as well.
+    """
     rng = np.random.default_rng(0)
     basis = drawn_basis(prototypes + 1, side)  # the first does not move
     marks = rng.uniform(0.1, 0.9, (12, 2)) * side
@@ -44,15 +47,15 @@ def matching_work(backends, prototypes=46, frames=450, side=128):
 
     def scan(name, some):
         views = [View(0, map_, basis.flows[1:][:some], flows)]
-        return FlowScan(basis, views, np.zeros(some, np.int64), backend=name)
+        return FlowScan(basis, views, np.zeros(some, np.int64), backend=name)()
 
     pixels = int((basis.w_f > 0.02).sum())
     return Work(
         f"matching scan, {prototypes} prototypes, {frames} frames of {side}x{side}",
-        scan("numpy", 1),
-        {n: Contender(lambda n=n: scan(n, prototypes), tolerance=1e-5) for n in backends},
-        bytes=frames * pixels * 2 * 4,
-        operations=prototypes * frames * pixels * 8,
+        lambda: scan("numpy", 1),
+        {n: Contender(lambda n=n: lambda: scan(n, prototypes), tolerance=1e-5) for n in backends},
+        bytes=frames * pixels * 2 * 4 * 3,
+        operations=prototypes * frames * pixels * 12 + frames * pixels * (22 + 4 * frames),
         items=frames,
         unit="frame",
         part=1 / prototypes,

@@ -43,6 +43,18 @@ def test_the_mean_shape_and_texture_are_means(few):
     assert_allclose(textures.mean(axis=0), aam.texture_mean, atol=0.002)
 
 
+def test_lights_are_taken_off_and_the_mean_keeps_that_of_the_mean_picture():
+    rng = np.random.default_rng(0)
+    plain = rng.uniform(0.2, 0.8, (60, 3)) + 0.05 * rng.normal(size=(9, 60, 3))
+    gain, offset = rng.uniform(0.5, 1.5, (9, 1, 3)), rng.uniform(-0.2, 0.2, (9, 1, 3))
+    textures = np.asarray(gain * plain + offset, np.float32)
+    picture = textures.mean(axis=0)
+    mean = aam_training._in_one_light(textures, [str(i) for i in range(9)])
+    assert_allclose(fit_light(mean, picture), [[1, 0]] * 3, atol=1e-3)
+    for texture in textures:
+        assert_allclose(fit_light(texture, mean), [[1, 0]] * 3, atol=0.01)
+
+
 def test_modes_are_those_of_a_full_svd(few):
     aam, shapes, textures = few
     s = (shapes - aam.mesh.vertices).reshape(12, -1)

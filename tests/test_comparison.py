@@ -1,5 +1,6 @@
 import json
 import warnings
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -151,12 +152,34 @@ def test_a_killed_comparison_goes_on_and_ends_in_the_same(tmp_path, monkeypatch)
     done.clear()
     assert compare(clips, saved, tmp_path / "work", options=options) == whole
     assert done == [1, 2]
+
+
+def test_folds_that_are_done_are_counted_and_other_features_begin_again(tmp_path, monkeypatch):
+    clips, done = corpus(tmp_path), run_here(monkeypatch)
+    options, saved = CompareOptions(folds=3, models=FEW), SavedFeatures(tmp_path)
+    keep, counted = comparison.write_step, []
+
+    @contextmanager
+    def progress_bar(total, name):
+        counted.append(total)
+        yield counted.append
+
+    def killed(folder, name, arrays):
+        if name == "fold-1":
+            raise KeyboardInterrupt
+        keep(folder, name, arrays)
+
+    monkeypatch.setattr(comparison, "progress_bar", progress_bar)
+    for _ in range(2):
+        with monkeypatch.context() as patch:
+            patch.setattr(comparison, "write_step", killed)
+            with pytest.raises(KeyboardInterrupt):
+                compare(clips, saved, tmp_path / "work", options=options)
+    assert done == [0]
+    assert counted == [6, 0, 1, 1, 1, 1, 6, 2, 1, 1]  # two models of the first fold were done
     np.savez(tmp_path / "s0.npz", features=np.load(tmp_path / "s0.npz")["features"] + 1)
-    with monkeypatch.context() as patch:
-        patch.setattr(comparison, "write_step", killed)
-        with pytest.raises(KeyboardInterrupt):
-            compare(clips, saved, tmp_path / "work", options=options)
-    assert done == [1, 2, 0]  # other features: from the beginning
+    compare(clips, saved, tmp_path / "work", options=options)
+    assert done == [0, 0, 1, 2]
 
 
 def test_a_fold_without_some_phone_is_said(tmp_path, monkeypatch, capsys):

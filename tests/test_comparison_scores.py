@@ -88,3 +88,11 @@ def test_models_are_tested_in_pairs_where_both_have_the_number():
 def test_what_does_not_differ_is_not_significant():
     same = [{"a": fold["a"], "b": fold["a"]} for fold in folds()]
     assert {(t["p_t"], t["p_wilcoxon"]) for t in paired_tests(same)} == {(1.0, 1.0)}
+
+
+def test_a_difference_that_is_the_same_in_every_fold_is_no_chance():
+    rows = [{"a": dict.fromkeys(METRICS, v), "b": dict.fromkeys(METRICS, v + 1)} for v in (1, 2, 4)]
+    assert [one["p_t"] for one in paired_tests(rows)] == [0] * len(METRICS)
+    same = [{name: dict.fromkeys(METRICS, v) for name in "ab"} for v in (1, 2, 4)]
+    assert [one["p_t"] for one in paired_tests(same)] == [1] * len(METRICS)
+    assert paired_tests(rows[:1]) == []
