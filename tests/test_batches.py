@@ -39,6 +39,13 @@ def test_a_single_item_that_does_not_fit_is_an_error():
     assert log == [(0, 4), (0, 2), (0, 1)]
 
 
-def test_other_errors_pass():
+def test_other_errors_pass_at_once():
+    log = []
+
+    def compute(part):
+        log.append(part)
+        return 1 // 0
+
     with pytest.raises(ZeroDivisionError):
-        in_parts(lambda part: 1 // 0, 4)
+        in_parts(compute, 4)
+    assert log == [slice(0, 4)]

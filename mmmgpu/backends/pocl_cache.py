@@ -71,9 +71,6 @@ def keep(folder: Path, archive: Path, known: set[str]) -> None:
             for other in archive.parent.glob("pocl-*.zip"):
                 if other != archive:
                     other.unlink(missing_ok=True)
-    except (
-        OSError,
-        InputError,
-    ):  # a full disk, or a home that cannot be written: compiled again next time
-        pass
+    except (OSError, InputError):
+        pass  # a full disk, or a home that cannot be written: compiled again next time
     shutil.rmtree(folder, ignore_errors=True)
