@@ -45,7 +45,7 @@ def live(
     lossless: Lossless = False,
     backend: Backend,
 ) -> None:
-    """Move the mouth of the model's person while the phones come in.
+    """Move the model's mouth while the phones come in.
 
     One phone a line is read from the standard input, and each makes one frame at the frame rate of
     the model. Frames go to the standard output as they are made: rows of RGB bytes, nothing else.

@@ -36,7 +36,7 @@ def track(
     backend: Backend,
     json: Json = None,
 ) -> None:
-    """Find the landmarks of CLIPs by fitting an appearance model, frame by frame.
+    """Find landmarks in CLIPs by fitting an appearance model.
 
     NAME.npz holds points (frames, N, 2) and features (frames, d); compare --features and aam read
     them. What the model cannot explain it cannot find: look at the residual of each clip.
