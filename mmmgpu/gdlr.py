@@ -51,19 +51,17 @@ Rows = NDArray[np.int64]
 POWER_ITERATIONS = 10  # find c_j to a quarter; descent would bear half
 DIVERGED = 1e100  # [model coordinates] no mean is that large
 SHAPES: Final = ("diagonal", "full")  # what is free in R_g
-DAMPINGS: Final = (1.0, 10.0)  # r, in frames
+DAMPING = 1.0  # r, in frames
 
 Metric = tuple[dict[str, Any], Array]  # constants as JSON values, (G, d, d + 1, d + 1)
 
 
 def bounded_metrics(system: System, mean: Array, class_of: Rows) -> Iterator[Metric]:
-    """H_g^-1 / max(c_j, 1), for either shape and damping; 0 for a class without frames."""
+    """H_g^-1 / max(c_j, 1), for either shape; 0 for a class without frames."""
     for shape in SHAPES:
-        for damping in DAMPINGS:
-            roots = curvature_roots(system.line.phone, mean, class_of, shape=shape, damping=damping)
-            c = np.broadcast_to(gain(system, mean, class_of, roots), mean.shape[1])
-            metric = roots @ roots / np.maximum(c, 1)[:, None, None]
-            yield {"shape": shape, "damping": damping}, metric
+        roots = curvature_roots(system.line.phone, mean, class_of, shape=shape)
+        c = np.broadcast_to(gain(system, mean, class_of, roots), mean.shape[1])
+        yield {"shape": shape}, roots @ roots / np.maximum(c, 1)[:, None, None]
 
 
 def paper_metrics(_: System, mean: Array, class_of: Rows) -> Iterator[Metric]:
@@ -192,7 +190,7 @@ def error_and_slope(
 
 
 def curvature_roots(
-    phone: Rows, mean: Array, class_of: Rows, *, shape: str, damping: float
+    phone: Rows, mean: Array, class_of: Rows, *, shape: str, damping: float = DAMPING
 ) -> Array:
     """H_g^-1/2 of each class, for each dimension, shape (G, d, d + 1, d + 1).
 

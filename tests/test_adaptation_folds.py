@@ -158,7 +158,7 @@ def candidate_mean(models, clips, method, constants):
     system = factor_system(line, models, np.full(D, SMOOTHNESS))
     m, s = standard_units(models)
     mean = (models.mean - m) / s
-    chosen = {key: constants[key] for key in ("shape", "damping")}
+    chosen = {"shape": constants["shape"]}
     metric = next(own for one, own in bounded_metrics(system, mean, rows) if one == chosen)
     path = descend_means(system, mean, (z - m) / s, rows, metric=constants["rate"] * metric)
     return m + s * path[constants["iterations"]]
