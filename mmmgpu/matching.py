@@ -23,12 +23,13 @@ from mmmgpu.analysis import solve_simplex
 from mmmgpu.backends import get_backend
 from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import MOUTH, Basis
-from mmmgpu.flow_matching import FlowScan, View, nearest_view, synthetic_flows
+from mmmgpu.flow_matching import Calibration, FlowScan, View, nearest_view, synthetic_flows
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+Choice = Callable[[Floats], tuple[Numbers, float]]  # costs (M, N) -> candidates, their sum
 
 BALANCE = 0.5  # t of the paper
 MOST_ITERATIONS = 30
@@ -42,8 +43,8 @@ class Matching:
     chosen: The frame of B for each prototype, (M,).
     flow_history: Candidates of flow matching: by C_syn, then after each calibration, (J + 1, M).
     history: Candidates after flow matching and after each iteration, (I + 1, M).
-    flow_distance, texture_distance: Of those candidates, each over its median, (I + 1, M); the
-        first texture distances are those of the first iteration.
+    flow_distance, texture_distance: Of those candidates, each over its median at the start,
+        (I + 1, M); textures are made of the candidates before.
     view: Which `View` was used for each prototype, (M,).
     texture: beta of Eq. 8, column k for prototype k, (M, M).
     outcome: "fixed point", "cycle" or "limit".
@@ -90,25 +91,18 @@ def match_prototypes(
             chosen[k] = n
         return chosen, float(cost[rows, chosen].sum())
 
-    flow_scan = FlowScan(source, views, view, backend=backend)
-    flow_history, start, _ = settle(
-        lambda chosen: choose(flow_scan(flow_scan.calibrate(chosen))),
-        choose(flow_scan())[0],
-        iterations,
+    flow_history, start, calibration, flow = _match_flows(
+        FlowScan(source, views, view, backend=backend), choose, iterations
     )
-    calibration = flow_scan.calibrate(start)
-    flow = flow_scan(calibration)
-    flow = flow / _median(flow)
-
     beta = texture_coordinates(source, views, view, backend=backend)
     flows = synthetic_flows(views, view, target.w_t.shape, calibration)
     texture_scan = _TextureScan(target, views, view, flows, beta, backend)
-    texture = texture_scan(start)
-    unit = _median(texture)
-    apart = [texture[rows, start] / unit]
+    first = texture_scan(start)
+    unit = _median(first)
+    apart = [first[rows, start] / unit]
 
     def by_both(chosen: Numbers) -> tuple[Numbers, float]:
-        texture = texture_scan(chosen) / unit
+        texture = (first if chosen is start else texture_scan(chosen)) / unit
         new, cost = choose(balance * flow + (1 - balance) * texture)
         apart.append(texture[rows, new])
         return new, cost
@@ -124,6 +118,21 @@ def match_prototypes(
         texture=beta,
         outcome=outcome,
     )
+
+
+def _match_flows(
+    scan: FlowScan, choose: Choice, iterations: int
+) -> tuple[Numbers, Numbers, Calibration, Floats]:
+    """Flow matching: candidates on the way, the last ones, and how far all flows are from theirs.
+
+    Distances (M, N) are those with the calibration on the last candidates, over their median.
+    """
+    history, chosen, _ = settle(
+        lambda candidates: choose(scan(scan.calibrate(candidates))), choose(scan())[0], iterations
+    )
+    calibration = scan.calibrate(chosen)
+    distance = scan(calibration)
+    return history, chosen, calibration, distance / _median(distance)
 
 
 def settle(
