@@ -22,9 +22,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
+from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
 from mmmgpu.backends.memory import keep_freed_memory
-from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
+from mmmgpu.errors import InputError
 
 NO_MEMORY = "Failed to allocate"  # what Warp says
 GONE = "CUDA error", "Failed to synchronize"
@@ -75,17 +76,10 @@ def _faults_of(device: str) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        said = " ".join(str(error).split())
-        if NO_MEMORY in said:
-            raise DeviceMemoryError(
-                f"warp:{device}: not enough memory ({said}); give smaller pictures, or choose "
-                "another device with --backend"
-            ) from error
-        if any(words in said for words in GONE):
-            raise DeviceError(
-                f"warp:{device}: the device failed ({said}); if it is still there, run the same "
-                "again, else choose another with --backend"
-            ) from error
+        if NO_MEMORY in str(error):
+            raise out_of_memory(f"warp:{device}", error) from error
+        if any(words in str(error) for words in GONE):
+            raise device_failed(f"warp:{device}", error) from error
         raise
 
 

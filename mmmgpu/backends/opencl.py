@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
 from mmmgpu.backends import default_threads
+from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
 from mmmgpu.backends.memory import keep_freed_memory
 from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
-from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
+from mmmgpu.errors import DeviceError, InputError
 
 LOCAL = 16  # work-items of a group; 1 where there are too few to go round
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # PoCL before and after 4.0
@@ -125,17 +126,10 @@ def _faults_of(device: str) -> Iterator[None]:
     try:
         yield
     except cl.Error as error:
-        said = " ".join(str(error).split())
         if error.code in NO_MEMORY:
-            raise DeviceMemoryError(
-                f"{device}: not enough memory ({said}); give smaller pictures, or choose another "
-                "device with --backend"
-            ) from error
+            raise out_of_memory(device, error) from error
         if error.code in GONE:
-            raise DeviceError(
-                f"{device}: the device failed ({said}); if it is still there, run the same again, "
-                "else choose another with --backend"
-            ) from error
+            raise device_failed(device, error) from error
         raise
 
 
