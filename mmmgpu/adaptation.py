@@ -38,10 +38,11 @@ from mmmgpu.models import Model
 from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.phonemes import PhonemeModels, Utterance, coverage
 from mmmgpu.phones import CE05_PHONES, SIL, ce05_phone
+from mmmgpu.picture_errors import flow_weights, texture_weights
 from mmmgpu.progress import progress_bar
 from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, principal_coordinates
-from mmmgpu.regression_classes import Classes, kmeans_classes, paper_classes
+from mmmgpu.regression_classes import Classes, broad_classes, kmeans_classes, paper_classes
 from mmmgpu.reselection import COVARIANCES, carry
 from mmmgpu.trajectories import scaled_smoothness
 from mmmgpu.trajectory_training import History, TrainedStream
@@ -49,7 +50,7 @@ from mmmgpu.trajectory_training import History, TrainedStream
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
-CLASSES = ("kmeans", "paper")
+CLASSES = ("broad", "kmeans", "paper")
 CLASS_COUNT = 4  # of k-means: 15 seconds hold too few phones for the paper's nine
 OTHER_STEP = "gdlr_other_step"  # among the curves: GDLR with the step that was not chosen
 LEAST_S = 1.0  # of speech and silence together
@@ -60,7 +61,8 @@ class AdaptOptions:
     """What a person may choose about adaptation.
 
     method: one of `adaptation_folds.METHODS`; the others are kept in the model for comparison.
-    classes: one of `CLASSES`: k-means on the phoneme means, or the paper's nine.
+    classes: one of `CLASSES`: silence, vowels and consonants; k-means on the phoneme means; or the
+        paper's nine.
     covariance: one of `reselection.COVARIANCES`, of the phoneme models after Eq. 13.
     step: one of `gdlr.RULES`.
     sync: [s] by which sound and alignments are moved against the picture; negative: earlier.
@@ -69,7 +71,7 @@ class AdaptOptions:
     """
 
     method: str = "gdlr"
-    classes: str = "kmeans"
+    classes: str = "broad"
     covariance: str = "diagonal"
     step: str = "bounded"
     sync: float = 0.0
@@ -192,12 +194,13 @@ class _Adaptation:
         spoken = [utterances_of(frames, z) for z in analysed]
         streams, others = [], []
         curves: dict[str, Any] = {}
-        for name, old, carried, utterances in zip(
-            ("alpha", "beta"), (model.alpha, model.beta), before, spoken, strict=True
+        weights = flow_weights(basis), texture_weights(basis, backend=self.backend)
+        for name, old, carried, utterances, seen in zip(
+            ("alpha", "beta"), (model.alpha, model.beta), before, spoken, weights, strict=True
         ):
             smoothness = scaled_smoothness(carried, old.constants.smoothness)
             start = replace(old, pooled=carried, trained=carried, smoothness=smoothness)
-            results = self._adapt(name, start, utterances, classes)
+            results = self._adapt(name, start, utterances, classes, seen)
             best = results[options.method]
             streams.append(_adapted_stream(start, best))
             others.append({method: found.models.mean for method, found in results.items()})
@@ -249,6 +252,8 @@ class _Adaptation:
 
     def _classes(self, before: Sequence[PhonemeModels]) -> Classes:
         """The phones that move together."""
+        if self.options.classes == "broad":
+            return broad_classes(before[0].labels)
         if self.options.classes == "paper":
             return paper_classes(before[0].labels)
         return kmeans_classes(*before, count=CLASS_COUNT, seed=self.options.seed)
@@ -259,6 +264,7 @@ class _Adaptation:
         start: TrainedStream,
         utterances: Sequence[Utterance],
         classes: Classes,
+        weights: Floats,
     ) -> dict[str, Adapted]:
         """One stream by every method, and by GDLR with the step that was not chosen."""
         with progress_bar(None, f"adapt {name}") as advance:
@@ -272,6 +278,7 @@ class _Adaptation:
                     method=method,
                     classes=classes,
                     rng=np.random.default_rng(self.options.seed),
+                    weights=weights,
                     descent=Descent(rule=step),
                     progress=lambda done, total: advance(1),
                 )
@@ -329,7 +336,7 @@ def _adapted_stream(start: TrainedStream, best: Adapted) -> TrainedStream:
 
 
 def _curve(result: Adapted) -> dict[str, Any]:
-    """What was tried and how well it did: mean squared errors of the clips used and left out.
+    """What was tried and how well it did: `Adapted.training` and `Adapted.validation`.
 
     "path": which candidates are the iterations of GDLR at the chosen rate, in order.
     """

@@ -2,9 +2,13 @@
 
 Five methods by one rule. Each makes a row of candidates: GDLR after 0, 1, 2, ... iterations at each
 of a few rates, MAP and the regressions with less and less held back. Candidates fitted on some of
-the clips are judged on the others by Eq. 4, the squared distance of their trajectories from the
-real ones; the best one, summed over the folds, is then fitted on all clips. So GDLR stops early,
-and every method has its constants from the same evidence.
+the clips are judged on the others by the squared distance of their trajectories y from the real
+ones z, in units of what is seen:
+
+    (z - y)' W (z - y),
+
+where Eq. 4 has I. The best one, summed over the folds, is then fitted on all clips. So GDLR stops
+early, and every method has its constants from the same evidence.
 
 Only means are adapted; Sigma, lambda and k stay.
 
@@ -51,8 +55,9 @@ class Adapted:
         candidates: The constants of all C candidates.
         training: Mean squared error (Eq. 4 over frames and dimensions) of each candidate on the
             clips it was fitted on, all of them, shape (C,).
-        validation: The same on clips left out, fitted on the others, shape (C,).
-        values: N d: how many squares the means are over; `training` times this is E of Eq. 4.
+        validation: Mean over the frames of (z - y)' W (z - y) on clips left out, fitted on the
+            others, shape (C,).
+        values: N d: how many squares are in `training`, which times this is E of Eq. 4.
     """
 
     models: PhonemeModels
@@ -86,9 +91,10 @@ class _Part:
     system: System
     z: Array
 
-    def error(self, mean: Array) -> float:
-        """E of Eq. 4."""
-        return float(np.sum((self.system.follow(mean) - self.z) ** 2))
+    def error(self, mean: Array, weights: Array) -> float:
+        """The sum over frames of (z - y)' W (z - y), W (d, d); with I, E of Eq. 4."""
+        off = self.z - self.system.follow(mean)
+        return float(np.sum(off @ weights * off))
 
 
 Method = Callable[[PhonemeModels, Rows, _Part, Descent], list[Candidate]]
@@ -145,6 +151,7 @@ def adapt_models(
     method: str,
     classes: Classes,
     rng: np.random.Generator,
+    weights: Array | None = None,
     folds: int = 5,
     descent: Descent = DESCENT,
     progress: Progress | None = None,
@@ -163,6 +170,8 @@ def adapt_models(
         method: One of `METHODS`.
         classes: Every phone of `models` in exactly one class.
         rng: Deals the clips into folds.
+        weights: W, shape (d, d), positive semidefinite: what errors count on clips left out; see
+            `mmmgpu.picture_errors`. None: I/d, the mean square.
         folds: At most so many; no more than clips, and a single clip is cut between segments.
         descent: How GDLR descends.
         progress: Called with (steps done, steps in all); what it raises ends the job.
@@ -176,7 +185,11 @@ def adapt_models(
     if folds < 2:
         raise InputError(f"folds: must be at least 2, got {folds}")
     _check_speech(models, utterances)
-    lam = checked_smoothness(smoothness, order, models.mean.shape[1])
+    d = models.mean.shape[1]
+    lam = checked_smoothness(smoothness, order, d)
+    weights = np.eye(d) / d if weights is None else weights
+    if weights.shape != (d, d):
+        raise InputError(f"weights: must have shape {(d, d)}, got {weights.shape}")
     clips = [_modelled(models, u) for u in utterances]
     fit = partial(_CANDIDATES[method], models, class_rows(models, classes))
     dealt = _deal(clips, rng, folds)
@@ -184,7 +197,7 @@ def adapt_models(
     for done, (train, left_out) in enumerate(dealt, start=1):
         judge = _prepare(models, left_out, lam, order)
         candidates = fit(_prepare(models, train, lam, order), descent)
-        trials.append([(constants, judge.error(mean)) for constants, mean in candidates])
+        trials.append([(constants, judge.error(mean, weights)) for constants, mean in candidates])
         if progress:
             progress(done, len(dealt) + 1)
     whole = _prepare(models, clips, lam, order)
@@ -212,14 +225,14 @@ def _choose(
         if all(json.dumps(constants) in fold for fold in errors)
     ]
     constants, mean, _ = min(shared, key=lambda candidate: candidate[2])
-    size = whole.z.size
+    size, d = whole.z.size, whole.z.shape[1]
     return Adapted(
         models=replace(models, mean=mean),
         method=method,
         constants=constants,
         candidates=tuple(own for own, _, _ in shared),
-        training=np.array([whole.error(mean) for _, mean, _ in shared]) / size,
-        validation=np.array([error for _, _, error in shared]) / size,
+        training=np.array([whole.error(mean, np.eye(d)) for _, mean, _ in shared]) / size,
+        validation=np.array([error for _, _, error in shared]) / len(whole.z),
         values=size,
     )
 

@@ -51,7 +51,7 @@ Rows = NDArray[np.int64]
 POWER_ITERATIONS = 10  # find c_j to a quarter; descent would bear half
 DIVERGED = 1e100  # [model coordinates] no mean is that large
 SHAPES: Final = ("diagonal", "full")  # what is free in R_g
-DAMPING = 1.0  # r, in frames
+DAMPING = 3.0  # r, in frames
 
 Metric = tuple[dict[str, Any], Array]  # constants as JSON values, (G, d, d + 1, d + 1)
 

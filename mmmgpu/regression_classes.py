@@ -16,9 +16,14 @@ from numpy.typing import NDArray
 
 from mmmgpu.errors import InputError
 from mmmgpu.phonemes import PhonemeModels
-from mmmgpu.phones import ce05_class
+from mmmgpu.phones import SIL, VOWELS, ce05_class
 
 Classes = tuple[tuple[str, ...], ...]
+
+
+def broad_classes(labels: Iterable[str]) -> Classes:
+    """Group `labels` into silence, vowels and consonants; empty classes are left out."""
+    return _grouped({p: (p == SIL) + 2 * (p in VOWELS) for p in labels})
 
 
 def paper_classes(labels: Iterable[str]) -> Classes:

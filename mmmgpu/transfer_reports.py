@@ -30,6 +30,7 @@ from mmmgpu.trajectory_files import Trajectory
 Bytes = NDArray[np.uint8]
 
 VOWELS = ("AA", "IY", "UH", "EH", "AO")  # of the paper's Fig. 5
+UNITS = {"alpha": 1, "beta": 255}  # of validation errors: px, and grey levels in place of [0, 1]
 SHOWN_HEIGHT = 420  # [px] of a reference with its points
 METHOD_NAMES = {
     "none": "no adaptation",
@@ -217,9 +218,10 @@ def _adaptation(model: Model) -> str:
         for stream in ("alpha", "beta"):
             curve = found["curves"][stream][method]
             best = curve["candidates"].index(curve["chosen"])
-            cells += [f"{curve['training'][best]:.5f}", f"{curve['validation'][best]:.5f}"]
+            seen = UNITS[stream] * np.sqrt(curve["validation"][best])
+            cells += [f"{np.sqrt(curve['training'][best]):.4f}", f"{seen:.2f}"]
         rows.append(cells)
-    head = ("mean squared error", "alpha, used", "left out", "beta, used", "left out")
+    head = ("RMS error", "alpha, used", "left out [px]", "beta, used", "left out [grey levels]")
     drawings = "".join(
         f'<figure class="small">{_descent(found["curves"][s][kind])}<figcaption>GDLR of {s} with '
         f"the {step} step, on the clips used and, by folds inside them, on those left out."
@@ -229,10 +231,9 @@ def _adaptation(model: Model) -> str:
     )
     return (
         "<h2>Adaptation</h2><p>How the phoneme models were moved to the second person's own "
-        "movements. Phones that were not seen move with their class.</p>"
-        + fact_table(facts)
-        + table(head, rows)
-        + drawings
+        "movements. Phones that were not seen move with their class. Errors on the clips used are "
+        "in model coordinates, those on clips left out in what is seen: the flow of the lips and "
+        "the grey levels of the mouth.</p>" + fact_table(facts) + table(head, rows) + drawings
     )
 
 

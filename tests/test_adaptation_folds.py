@@ -114,6 +114,26 @@ def test_gdlr_does_the_same_in_other_units_and_about_another_origin(world):
     np.testing.assert_allclose(other.models.mean, 7 + 0.01 * near.models.mean, rtol=1e-9)
 
 
+def test_candidates_are_judged_by_what_their_errors_are_worth(world):
+    """One direction alone counts here."""
+    models, _, clips, _ = world
+    direction = np.array([1.0, -1, 0, 0])
+    plain = adapt(models, clips, "gdlr")
+    seen = adapt(models, clips, "gdlr", weights=np.outer(direction, direction))
+    squares = 0.0
+    for left_out in clips:
+        rest = [u for u in clips if u is not left_out]
+        mean = candidate_mean(models, rest, "gdlr", seen.constants)
+        y = synthesize_trajectory(
+            replace(models, mean=mean), left_out.labels, smoothness=SMOOTHNESS
+        )
+        squares += float(np.sum(((left_out.z - y) @ direction) ** 2))
+    best, frames = seen.candidates.index(seen.constants), sum(len(u.z) for u in clips)
+    assert seen.validation[best] == seen.validation.min() == pytest.approx(squares / frames)
+    assert seen.constants != plain.constants
+    np.testing.assert_array_equal(seen.training, plain.training)
+
+
 def test_none_changes_nothing(world):
     models, _, clips, _ = world
     adapted = adapt(models, clips, "none")
@@ -282,6 +302,7 @@ def test_arguments_are_left_as_they_were(world):
         (["SIL", "AA", "B"] * 9, {"folds": 1}, "folds: must be at least 2, got 1"),
         (["SIL", "AA", "B"] * 9, {"classes": CLASSES[1:]}, "phone 'AA' of the model is in 0"),
         (["SIL", "AA", "B"] * 9, {"smoothness": -1.0}, "smoothness: must be"),
+        (["SIL", "AA", "B"] * 9, {"weights": np.eye(3)}, r"weights: must have shape \(4, 4\), got"),
     ],
 )
 def test_bad_input_is_named(world, labels, options, message):

@@ -4,7 +4,7 @@ import pytest
 from mmmgpu.errors import InputError
 from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.phones import CE05_CLASSES, CMU_PHONES, DIPHTHONGS
-from mmmgpu.regression_classes import class_rows, kmeans_classes, paper_classes
+from mmmgpu.regression_classes import broad_classes, class_rows, kmeans_classes, paper_classes
 
 
 def models(mean, labels=None, variance=None):
@@ -25,6 +25,12 @@ def test_diphthongs_go_with_their_nucleus_and_empty_classes_are_left_out():
     for label, (nucleus, _) in DIPHTHONGS.items():
         assert next(own for own in classes if label in own).count(nucleus) == 1
     assert paper_classes(["SIL", "B", "ʒ", "M"]) == (("B", "M"), ("ʒ",), ("SIL",))
+
+
+def test_broad_classes_are_silence_vowels_and_consonants():
+    found = broad_classes(["SIL", "B", "AY", "AXR", "ʒ", "BR", "IY"])
+    assert found == (("B", "BR", "ʒ"), ("SIL",), ("AXR", "AY", "IY"))
+    assert broad_classes(["UW", "M"]) == (("M",), ("UW",))
 
 
 def test_kmeans_finds_the_groups_of_both_streams():

@@ -41,7 +41,8 @@ def adapt(
         str,
         typer.Option(
             metavar="NAME",
-            help="Phones that move together: kmeans, or paper for the nine of the paper.",
+            help="Phones that move together: broad for silence, vowels and consonants, kmeans, or "
+            "paper for the nine of the paper.",
             default_factory=LibraryDefault(*_OPTIONS, "classes"),
         ),
     ],
