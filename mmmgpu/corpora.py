@@ -26,6 +26,15 @@ class Clip:
     alignment: Alignment
 
     @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def length(self) -> int:
+        """The number of frames."""
+        return self.info.frames
+
+    @property
     def labels(self) -> list[str]:
         """The majority phone of every frame."""
         return frame_labels(self.alignment, self.info.frames, float(self.info.fps))

@@ -1,15 +1,15 @@
 """What all jobs do with every clip of a corpus: track it, cut it, analyse it.
 
-What is found for a clip is kept in a folder of finished steps (`mmmgpu.checkpoints`); worker
-processes do the clips.
+What is found for a clip, or for a stretch of one, is kept in a folder of finished steps
+(`mmmgpu.checkpoints`); worker processes do the clips.
 """
 
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +33,13 @@ from mmmgpu.phonemes import Utterance
 from mmmgpu.processes import Tick, Work, share_out
 from mmmgpu.progress import progress_bar
 from mmmgpu.regions import Region, mouth_mask
-from mmmgpu.tracks import Reference, Track, crop, crops, frame_at, rebase, track_clip
-from mmmgpu.videos import read_frames
+from mmmgpu.tracks import Reference, Track, crop, crops, rebase, track_clip
+from mmmgpu.videos import read_chosen_frames
 
 Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
+
+STRETCHES = 8  # at least, of a corpus: to decode up to one costs little beside analysing it
 
 
 def make_model(
@@ -58,31 +60,40 @@ def make_model(
     return model
 
 
+class Piece(Protocol):
+    """What a process does at a time, a clip or a stretch of one; no two have one name."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def length(self) -> int: ...
+
+
 def for_all(
     folder: Path,
     prepare: Callable[[Any], Work],
     shared: Any,
     step: str,
     label: str,
-    items: Sequence[Any],
+    pieces: Sequence[Piece],
 ) -> None:
-    """Do what ``prepare(shared)`` returns to every item whose step is not yet in `folder`.
+    """Do what ``prepare(shared)`` returns to every piece whose step is not yet in `folder`.
 
-    An item is a clip, or a tuple that begins with one. `label` names the progress bar.
+    `label` names the progress bar.
     """
-    clips = [item[0] if isinstance(item, tuple) else item for item in items]
-    done = [read_step(folder, f"{step}-{clip.path.name}") is not None for clip in clips]
-    with progress_bar(sum(clip.info.frames for clip in clips), label) as advance:
-        advance(sum(c.info.frames for c, d in zip(clips, done, strict=True) if d))
-        left = [item for item, d in zip(items, done, strict=True) if not d]
+    left = [piece for piece in pieces if read_step(folder, f"{step}-{piece.name}") is None]
+    total = sum(piece.length for piece in pieces)
+    with progress_bar(total, label) as advance:
+        advance(total - sum(piece.length for piece in left))
         with finished_steps_only(folder):
             share_out(prepare, shared, left, processes=default_threads(), advance=advance)
 
 
-def finished_step(folder: Path, step: str, name: str) -> dict[str, NDArray[Any]]:
-    """A step that has been done for the clip called `name`."""
-    arrays = read_step(folder, f"{step}-{name}")
-    assert arrays is not None, (step, name)
+def finished_step(folder: Path, step: str, piece: Piece) -> dict[str, NDArray[Any]]:
+    """A step that has been done for `piece`."""
+    arrays = read_step(folder, f"{step}-{piece.name}")
+    assert arrays is not None, (step, piece.name)
     return arrays
 
 
@@ -98,8 +109,8 @@ def track_corpus(
     for_all(folder, _tracking, shared, "track", "track frames", corpus)
     tracks, skipped = {}, {}
     for clip in corpus:
-        name = clip.path.name
-        arrays = finished_step(folder, "track", name)
+        name = clip.name
+        arrays = finished_step(folder, "track", clip)
         if "skipped" in arrays:
             skipped[name] = str(arrays["skipped"])
             print(f"warning: skipped: {skipped[name]}", file=sys.stderr)
@@ -136,29 +147,59 @@ def analyse_corpus(
 ) -> tuple[list[Floats], list[Floats]]:
     """alpha (T, M - 1) and beta (T, M) of every clip of `frames`."""
     shared = (folder, basis, flow, backend)
-    items = [(clip, frames.tracks[clip.path.name]) for clip in frames.clips]
-    for_all(folder, _analysing, shared, "analysis", "analyse frames", items)
-    done = [finished_step(folder, "analysis", clip.path.name) for clip in frames.clips]
-    return [d["alpha"] for d in done], [d["beta"] for d in done]
+    for_all(folder, _analysing, shared, "analysis", "analyse frames", frames.stretches)
+    alpha: dict[str, list[Floats]] = {clip.name: [] for clip in frames.clips}
+    beta: dict[str, list[Floats]] = {clip.name: [] for clip in frames.clips}
+    for stretch in frames.stretches:
+        done = finished_step(folder, "analysis", stretch)
+        alpha[stretch.clip.name].append(done["alpha"])
+        beta[stretch.clip.name].append(done["beta"])
+    whole = [[np.concatenate(found) for found in of.values()] for of in (alpha, beta)]
+    return whole[0], whole[1]
 
 
 def _analysing(shared: tuple[Path, Basis, str, str]) -> Work:
-    """Keeps alpha and beta of every frame of a clip."""
+    """Keeps alpha and beta of every frame of a stretch."""
     folder, basis, flow, backend = shared
     analyzer = prepare_analysis(basis, get_backend(backend, 1), flow=flow)
 
-    def work(item: tuple[Clip, Track], tick: Tick) -> None:
-        clip, track = item
+    def work(stretch: Stretch, tick: Tick) -> None:
         alpha, beta = [], []
-        for image in crops(clip.path, track, basis.region):
+        for image in stretch.crops(basis.region):
             a, b = analyze(analyzer, image)
             alpha.append(a)
             beta.append(b)
             tick()
         arrays = {"alpha": np.array(alpha, np.float32), "beta": np.array(beta, np.float32)}
-        write_step(folder, f"analysis-{clip.path.name}", arrays)
+        write_step(folder, f"analysis-{stretch.name}", arrays)
 
     return work
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """The frames start <= t < stop of a tracked clip."""
+
+    clip: Clip
+    track: Track
+    start: int
+    stop: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.clip.name}-{self.start}"
+
+    @property
+    def length(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def registered(self) -> NDArray[np.bool_]:
+        return self.track.registered[self.start : self.stop]
+
+    def crops(self, region: Region) -> Iterator[F32]:
+        """The region of each frame, (h, w, 3)."""
+        return crops(self.clip.path, self.track, region, start=self.start, stop=self.stop)
 
 
 @dataclass(frozen=True)
@@ -172,7 +213,7 @@ class Thumbnails(Sequence[NDArray[np.uint8]]):
         return len(self.clips)
 
     def __getitem__(self, i: Any) -> Any:
-        return finished_step(self.folder, "track", self.clips[i].path.name)["thumbnails"]
+        return finished_step(self.folder, "track", self.clips[i])["thumbnails"]
 
 
 @dataclass(frozen=True)
@@ -189,18 +230,30 @@ class Frames:
     def find(self, i: int) -> tuple[Clip, int]:
         """The clip and its frame that are number `i` of the row."""
         for clip in self.clips:
-            if i < clip.info.frames:
+            if i < clip.length:
                 return clip, i
-            i -= clip.info.frames
+            i -= clip.length
         raise IndexError(i)
+
+    @property
+    def stretches(self) -> list[Stretch]:
+        """All frames in order; few clips are cut, so that all processes end at the same time."""
+        found = []
+        for clip in self.clips:
+            parts = min(clip.length, -(-STRETCHES // len(self.clips)))
+            ends = [clip.length * part // parts for part in range(parts + 1)]
+            track = self.tracks[clip.name]
+            found += [Stretch(clip, track, *ends[part : part + 2]) for part in range(parts)]
+        return found
 
     def pictures(
         self, numbers: Iterable[int]
     ) -> tuple[NDArray[np.uint8], tuple[tuple[str, int], ...]]:
         """Some frames in full, (n, H, W, 3), and the clip name and frame number of each."""
-        places = [self.find(int(i)) for i in numbers]
-        whole = np.stack([frame_at(clip.path, t) for clip, t in places])
-        return whole, tuple((clip.path.name, t) for clip, t in places)
+        wanted = [int(i) for i in numbers]
+        found = {i: (frame, (clip.name, t)) for i, clip, t, frame in self._read(wanted)}
+        whole, places = zip(*(found[i] for i in wanted), strict=True)
+        return np.stack(whole), places
 
     def number(self, name: str, t: int) -> int:
         """The number in the row of frame `t` of the clip called `name`."""
@@ -211,19 +264,23 @@ class Frames:
             before += clip.info.frames
         raise KeyError(name)
 
-    def crops(self, numbers: Sequence[int], region: Region) -> dict[int, F32]:
-        """The regions of some frames, each clip read once; `numbers` is sorted."""
-        found, first = {}, 0
+    def crops(self, numbers: Iterable[int], region: Region) -> dict[int, F32]:
+        """The regions of some frames, by number, rising."""
+        return {
+            i: crop(frame, self.tracks[clip.name].poses[t], self.tracks[clip.name], region)
+            for i, clip, t, frame in self._read(numbers)
+        }
+
+    def _read(self, numbers: Iterable[int]) -> Iterator[tuple[int, Clip, int, NDArray[np.uint8]]]:
+        """Some frames in full, rising, with number, clip and place in it; a clip is read once."""
+        wanted = np.unique(np.fromiter(numbers, np.int64))
+        first = 0
         for clip in self.clips:
-            wanted = {i - first for i in numbers if first <= i < first + clip.info.frames}
-            if wanted:
-                track = self.tracks[clip.path.name]
-                frames = read_frames(clip.path, stop=max(wanted) + 1)
-                for t, frame in enumerate(frames):
-                    if t in wanted:
-                        found[first + t] = crop(frame, track.poses[t], track, region)
-            first += clip.info.frames
-        return found
+            own = wanted[(first <= wanted) & (wanted < first + clip.length)] - first
+            if len(own):
+                for t, frame in zip(own.tolist(), read_chosen_frames(clip.path, own), strict=True):
+                    yield first + t, clip, t, frame
+            first += clip.length
 
 
 def rebased_frames(

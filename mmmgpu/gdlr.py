@@ -176,7 +176,10 @@ def extended(mean: Array) -> Array:
 
 def regressed(R: Array, mean: Array, class_of: Rows) -> Array:
     """R_g xi_p with g the class of p, shape (P, d)."""
-    return np.asarray(np.einsum("pij,pj->pi", R[class_of], extended(mean)))
+    xi, moved = extended(mean), np.empty_like(mean)
+    for g, own in _members(class_of):
+        moved[own] = xi[own] @ R[g].T
+    return moved
 
 
 def error_and_slope(
@@ -184,9 +187,15 @@ def error_and_slope(
 ) -> tuple[float, Array]:
     """Eq. 4 with the means R_g xi_p, and dE/dR_g, shape (G, d, d + 1)."""
     E, by_mean = system.error_and_slope(regressed(R, mean, class_of), z)
-    slope = np.zeros_like(R)
-    np.add.at(slope, class_of, by_mean[:, :, None] * extended(mean)[:, None, :])
+    xi, slope = extended(mean), np.zeros_like(R)
+    for g, own in _members(class_of):
+        slope[g] = by_mean[own].T @ xi[own]
     return E, slope
+
+
+def _members(class_of: Rows) -> list[tuple[int, Rows]]:
+    """Every class that has phones, and these."""
+    return [(int(g), np.flatnonzero(class_of == g)) for g in np.unique(class_of)]
 
 
 def curvature_roots(

@@ -28,10 +28,11 @@ def texture_weights(basis: Basis, *, backend: str = "warp") -> Floats:
     """W of beta, (M, M): e' W e is the mean square over colours under w_t, in [0, 1]^2."""
     y, x = np.indices(basis.w_t.shape)
     textures = sample(basis.images, np.stack([x, y], axis=-1) + basis.flows, backend=backend)
-    return _gram(textures - textures.mean(axis=0), basis.w_t) / textures.shape[-1]
+    W = _gram(textures - textures.mean(axis=0), basis.w_t)
+    return np.asarray(W / textures.shape[-1])
 
 
 def _gram(fields: F32, mask: F32) -> Floats:
     """Products of fields (n, h, w, c), summed over c, in the mean under a mask (h, w): (n, n)."""
     shown = (fields * np.sqrt(mask)[..., None]).reshape(len(fields), -1)
-    return np.asarray(shown @ shown.T, np.float64) / float(mask.sum())
+    return np.asarray(shown @ shown.T / mask.sum(), np.float64)

@@ -34,7 +34,7 @@ def prototype_basis(
     match, mask = matcher(flow), mouth_mask(region)
     before = shortest_paths(coordinates, origin)
     paths = {int(i): path_to(int(i), before) for i in chosen}
-    images = frames.crops(sorted({i for path in paths.values() for i in path}), region)
+    images = frames.crops({i for path in paths.values() for i in path}, region)
     pairs = [(origin, i) for i in paths] + [p for path in paths.values() for p in pairwise(path)]
 
     def step(pair: tuple[int, int], _: Cancelled) -> F32:

@@ -156,9 +156,12 @@ def crop(frame: NDArray[np.uint8], pose: Floats, track: Track, region: Region) -
     return np.clip(image + track.offset.astype(np.float32), 0, 1)
 
 
-def crops(path: Path, track: Track, region: Region) -> Iterator[F32]:
-    """The regions of all frames of a clip, in order."""
-    for frame, pose in zip(read_frames(path), track.poses, strict=False):
+def crops(
+    path: Path, track: Track, region: Region, *, start: int = 0, stop: int | None = None
+) -> Iterator[F32]:
+    """The regions of the frames `start` <= t < `stop` of a clip, in order; without both, of all."""
+    frames = read_frames(path, start=start, stop=stop)
+    for frame, pose in zip(frames, track.poses[start:stop], strict=False):
         yield crop(frame, pose, track, region)
 
 

@@ -23,6 +23,7 @@ from mmmgpu.checkpoints import write_step
 from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.corpus_steps import (
     Frames,
+    Stretch,
     calmest,
     finished_step,
     for_all,
@@ -43,10 +44,12 @@ from mmmgpu.processes import Tick, Work
 from mmmgpu.reference_pairs import pose_of
 from mmmgpu.regions import Region, carried_mouth, mouth_mask, region_around
 from mmmgpu.registration import head_from_frame, project
-from mmmgpu.tracks import Reference, Track, crop, crops, frame_at, make_reference
+from mmmgpu.tracks import Reference, crop, frame_at, make_reference
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
+
+IMAGES = "images"  # beside the kinds of reference frames, what a step of flows keeps
 
 
 @dataclass(frozen=True)
@@ -174,8 +177,8 @@ class _Transfer:
         w_f, w_t = (carried_mask(m, to_region, region.shape) for m in (old.w_f, old.w_t))
         inside = around(np.maximum(w_f, w_t) > MOUTH)
         near = part_of(region, inside)
-        images = _images(frames, near)
-        flows = self._flows(frames, near, w_t[inside])
+        flows = self._seen(frames, near, w_t[inside])
+        images = flows.pop(IMAGES)
         views = [
             View(
                 self.marked[kind].prototype,
@@ -285,7 +288,7 @@ class _Transfer:
     def _basis(self, frames: Frames, region: Region, chosen: NDArray[np.int64]) -> Basis:
         """The basis of the frames of B that are number `chosen`, on the whole region."""
         origins = self._references(frames, region)
-        images = frames.crops(sorted({int(i) for i in chosen}), region)
+        images = frames.crops(chosen, region)
         flows_to = _flow_finder(origins, mouth_mask(region), matcher(self.options.flow))
 
         def one(image: F32, _: Cancelled) -> F32:
@@ -296,17 +299,18 @@ class _Transfer:
         pictures, moved = (np.stack([found[int(i)] for i in chosen]) for found in (images, flows))
         return make_basis(pictures, moved, self.source.basis.reference, region)
 
-    def _flows(self, frames: Frames, region: Region, mask: F32) -> dict[str, F32]:
-        """Flows of B's usable frames from each of its reference frames, (N, h', w', 2)."""
+    def _seen(self, frames: Frames, region: Region, mask: F32) -> dict[str, F32]:
+        """B's usable frames: `region` of each, (N, h', w', 3), called `IMAGES`; and its flows from
+        each reference frame, (N, h', w', 2).
+        """
         shared = (self.folder, region, self._references(frames, region), mask, self.options.flow)
-        items = [(clip, frames.tracks[clip.path.name]) for clip in frames.clips]
-        for_all(self.folder, _flowing, shared, "flow", "flows of frames", items)
-        parts: dict[str, list[F32]] = {kind: [] for kind in self.marked}
-        for clip in frames.clips:
-            step = finished_step(self.folder, "flow", clip.path.name)
-            for kind, flows in parts.items():
-                flows.append(step[kind][frames.tracks[clip.path.name].registered])
-        return {kind: np.concatenate(flows) for kind, flows in parts.items()}
+        for_all(self.folder, _flowing, shared, "flow", "flows of frames", frames.stretches)
+        parts: dict[str, list[F32]] = {name: [] for name in (IMAGES, *self.marked)}
+        for stretch in frames.stretches:
+            step = finished_step(self.folder, "flow", stretch)
+            for name, found in parts.items():
+                found.append(step[name][stretch.registered])
+        return {name: np.concatenate(found) for name, found in parts.items()}
 
     def _notes(
         self,
@@ -351,16 +355,6 @@ def carried_mask(mask: F32, s: Correspondence, shape: tuple[int, int]) -> F32:
     return np.asarray(cv2.remap(mask, p[..., 0], p[..., 1], cv2.INTER_LINEAR), np.float32)
 
 
-def _images(frames: Frames, region: Region) -> F32:
-    """`region` of every frame whose head was found, (N, h, w, 3)."""
-    found = []
-    for clip in frames.clips:
-        track = frames.tracks[clip.path.name]
-        seen = zip(crops(clip.path, track, region), track.registered, strict=True)
-        found += [image for image, good in seen if good]
-    return np.stack(found)
-
-
 def _flow_finder(
     origins: Mapping[str, F32], mask: F32, match: Matcher
 ) -> Callable[[F32], dict[str, F32]]:
@@ -379,17 +373,16 @@ def _flow_finder(
 
 
 def _flowing(shared: tuple[Path, Region, Mapping[str, F32], F32, str]) -> Work:
-    """Keeps the flows of every frame of a clip, from each reference."""
+    """Keeps the pictures of a stretch and their flows from each reference."""
     folder, region, origins, mask, flow = shared
     flows_to = _flow_finder(origins, mask, matcher(flow))
 
-    def work(item: tuple[Clip, Track], tick: Tick) -> None:
-        clip, track = item
-        flows: dict[str, list[F32]] = {kind: [] for kind in origins}
-        for image in crops(clip.path, track, region):
-            for kind, found in flows_to(image).items():
-                flows[kind].append(found)
+    def work(stretch: Stretch, tick: Tick) -> None:
+        seen: dict[str, list[F32]] = {name: [] for name in (IMAGES, *origins)}
+        for image in stretch.crops(region):
+            for name, found in {IMAGES: image, **flows_to(image)}.items():
+                seen[name].append(found)
             tick()
-        write_step(folder, f"flow-{clip.path.name}", {k: np.stack(f) for k, f in flows.items()})
+        write_step(folder, f"flow-{stretch.name}", {k: np.stack(f) for k, f in seen.items()})
 
     return work

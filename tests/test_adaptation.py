@@ -165,7 +165,7 @@ def test_choices_are_followed(two_persons, before, tmp_path, options, kept):
     ("options", "says"),
     [
         ({"method": "magic"}, r"method: must be one of none, shift, map, mllr, gdlr"),
-        ({"classes": "mine"}, r"classes: must be one of kmeans, paper"),
+        ({"classes": "mine"}, r"classes: must be one of broad, kmeans, paper"),
         ({"covariance": "half"}, r"covariance: must be one of diagonal, full"),
         ({"step": "giant"}, r"step: must be one of bounded, paper"),
     ],
