@@ -18,6 +18,10 @@ the frames do not say otherwise, and frames that lie far off count less: some ar
 
 V is a mixture of B's flows, so C'_k is KEPT C_syn,k plus a mixture of B's flows: known on all of
 B's pixels, whatever pixels it was found on.
+
+With several pairs of reference frames all of this is done for each, and a prototype and a frame are
+as far apart as in the pair that brings them nearer: where lips part or meet between a reference and
+either of them, the flows from there say little.
 """
 
 from collections.abc import Sequence
@@ -30,7 +34,6 @@ from numpy.typing import NDArray
 from mmmgpu.backends import Backend, get_backend
 from mmmgpu.basis import LIP, Basis
 from mmmgpu.correspondence import Correspondence
-from mmmgpu.flows import explanation_error
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -60,26 +63,11 @@ class View:
     flows_b: F32
 
 
-def nearest_view(source: Basis, views: Sequence[View]) -> Numbers:
-    """Which view each prototype of A is nearer to: whose flow explains it better, (M,).
-
-    Flow magnitude would not tell: where lips part or meet, a flow may be small and wrong.
-    """
-    errors = [
-        [
-            explanation_error(source.images[v.reference_a], image, flow, source.w_t)
-            for image, flow in zip(source.images, v.flows_a, strict=True)
-        ]
-        for v in views
-    ]
-    return np.asarray(np.argmin(errors, axis=0), np.int64)
-
-
 @dataclass(frozen=True)
 class Calibration:
-    """C'_k = kept C_syn,k + sum_n mixture_kn C_n, in the view of prototype k.
+    """C'_k = kept_v C_syn,k + sum_n mixture_vkn C_n in view v.
 
-    kept: (M,). mixture: (M, N).
+    kept: (V,). mixture: (V, M, N).
     """
 
     kept: F32
@@ -87,47 +75,38 @@ class Calibration:
 
 
 class FlowScan:
-    """Eq. 7 for all frames of B: distances (M, N) [px], means over A's pixels under w_f.
+    """Eq. 7 for all frames of B: distances (V, M, N) [px], means over A's pixels under w_f.
 
-    views, view: Reference pairs, and which of them each prototype of A uses, (M,).
+    views: V reference pairs.
     """
 
-    def __init__(
-        self, source: Basis, views: Sequence[View], view: Numbers, *, backend: str = "warp"
-    ):
-        kernels = get_backend(backend)
+    def __init__(self, source: Basis, views: Sequence[View], *, backend: str = "warp"):
+        self._kernels = get_backend(backend)
         y, x = np.nonzero(source.w_f > LIP)
         weight = source.w_f[y, x]
         self._weight = (weight / weight.sum()).astype(np.float32)
-        self._view, self._kernels = view, kernels
         pixels = np.stack([x, y], axis=1)
-        self._sides = [_side(v, pixels, self._weight, kernels) for v in views]
+        self._sides = [_side(v, pixels, self._weight, self._kernels) for v in views]
 
     def __call__(self, calibration: Calibration | None = None) -> Floats:
         """Distances of C_syn or, with a calibration, of C' to the flows of B's frames."""
-        distance = np.empty((len(self._view), len(self._sides[0].corpus)))
-        on_device = self._kernels.to_device
+        weight, found = self._kernels.to_device(self._weight), []
         for r, side in enumerate(self._sides):
-            mine = np.flatnonzero(self._view == r)
-            if len(mine):
-                queries = calibrated(side.queries[mine], side.corpus, calibration, mine)
-                scanned = self._kernels.distance_scan(
-                    on_device(queries), side.on_device, on_device(self._weight)
-                )
-                distance[mine] = self._kernels.to_host(scanned)
-        return distance
+            queries = calibrated(side.queries, side.corpus, calibration, r)
+            given = self._kernels.to_device(queries), side.on_device, weight
+            found.append(self._kernels.to_host(self._kernels.distance_scan(*given)))
+        return np.array(found, np.float64)
 
     def calibrate(self, chosen: Numbers) -> Calibration:
         """The calibration on the frames `chosen` (M,) for the prototypes, in each view."""
-        kept = np.ones(len(chosen), np.float32)
-        mixture = np.zeros((len(chosen), len(self._sides[0].corpus)), np.float32)
+        kept = np.ones(len(self._sides), np.float32)
+        mixture = np.zeros((len(kept), len(chosen), len(self._sides[0].corpus)), np.float32)
         for r, side in enumerate(self._sides):
-            mine = np.flatnonzero(self._view == r)
             if not len(side.directions):
                 continue
             linear, offset = robust_map(side.z, side.y[chosen])
             wanted = side.z @ linear.T + offset - KEPT * side.z
-            kept[mine], mixture[mine] = KEPT, (wanted @ side.directions)[mine]
+            kept[r], mixture[r] = KEPT, wanted @ side.directions
         return Calibration(kept, mixture)
 
 
@@ -197,12 +176,18 @@ def robust_map(z: Floats, y: Floats) -> tuple[Floats, Floats]:
     return np.asarray(solved[:size].T), np.asarray(solved[size])
 
 
-def calibrated(own: F32, corpus: F32, calibration: Calibration | None, mine: Numbers) -> F32:
-    """C' of the prototypes `mine`, (K, ..., 2), from their C_syn and B's flows, (N, ..., 2)."""
+def calibrated(
+    own: F32,
+    corpus: F32,
+    calibration: Calibration | None,
+    r: int,
+    mine: Numbers | slice = slice(None),
+) -> F32:
+    """C' of the prototypes `mine` in view r, (K, ..., 2), from C_syn and B's flows, (N, ..., 2)."""
     if calibration is None:
         return own
-    kept = calibration.kept[mine].reshape(-1, *[1] * (own.ndim - 1))
-    return np.asarray(kept * own + np.tensordot(calibration.mixture[mine], corpus, axes=1))
+    mixed = np.tensordot(calibration.mixture[r, mine], corpus, axes=1)
+    return np.asarray(calibration.kept[r] * own + mixed)
 
 
 def synthetic_flows(
@@ -211,7 +196,7 @@ def synthetic_flows(
     shape: tuple[int, int],
     calibration: Calibration | None = None,
 ) -> F32:
-    """C_syn,k or C'_k on B's own pixels, (M, h', w', 2) [px].
+    """C_syn,k or C'_k on B's own pixels, (M, h', w', 2) [px], in the view of prototype k.
 
     Where S(p) = q, C_syn,k is S(p + C_k(p)) - q; outside of A's region there is no flow.
     """
@@ -224,5 +209,5 @@ def synthetic_flows(
         for k in mine:
             moved = cv2.remap(v.flows_a[k], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
             flows[k] = v.correspondence(p + moved) - q
-        flows[mine] = calibrated(flows[mine], v.flows_b, calibration, mine)
+        flows[mine] = calibrated(flows[mine], v.flows_b, calibration, r, mine)
     return flows

@@ -23,7 +23,7 @@ from mmmgpu.analysis import solve_simplex
 from mmmgpu.backends import get_backend
 from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import MOUTH, Basis
-from mmmgpu.flow_matching import Calibration, FlowScan, View, nearest_view, synthetic_flows
+from mmmgpu.flow_matching import FlowScan, View, synthetic_flows
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
@@ -45,7 +45,7 @@ class Matching:
     history: Candidates after flow matching and after each iteration, (I + 1, M).
     flow_distance, texture_distance: Of those candidates, each over its median at the start,
         (I + 1, M); textures are made of the candidates before.
-    view: Which `View` was used for each prototype, (M,).
+    view: Which `View` brings each prototype nearest to its candidate by flow, (M,).
     texture: beta of Eq. 8, column k for prototype k, (M, M).
     outcome: "fixed point", "cycle" or "limit".
     """
@@ -76,14 +76,14 @@ def match_prototypes(
         source: A's prototypes, (M, h, w, 3), and masks.
         target: All frames of B in place of prototypes, (N, h', w', 3), and B's masks; its flows are
             not looked at.
-        views: Reference pairs; every prototype uses the one whose reference it is nearer to.
+        views: Reference pairs; a prototype and a frame are compared in the one that brings them
+            nearer.
         fixed: Pairs (prototype, frame) that are known.
         balance: t in [0, 1]: 1 is Eq. 7 alone, 0 is Eq. 10 alone.
         iterations: At most so many, of flow matching and of both together.
         backend: A name for `mmmgpu.backends.get_backend`.
     """
-    view = nearest_view(source, views)
-    rows = np.arange(len(view))
+    rows = np.arange(len(source.images))
 
     def choose(cost: Floats) -> tuple[Numbers, float]:
         chosen = cost.argmin(axis=1).astype(np.int64)
@@ -91,9 +91,13 @@ def match_prototypes(
             chosen[k] = n
         return chosen, float(cost[rows, chosen].sum())
 
-    flow_history, start, calibration, flow = _match_flows(
-        FlowScan(source, views, view, backend=backend), choose, iterations
-    )
+    scan = FlowScan(source, views, backend=backend)
+    flow_history, start = _match_flows(scan, choose, iterations)
+    calibration = scan.calibrate(start)
+    distances = scan(calibration)
+    view = distances[:, rows, start].argmin(axis=0)
+    flow = distances.min(axis=0)
+    flow /= _median(flow)
     beta = texture_coordinates(source, views, view, backend=backend)
     flows = synthetic_flows(views, view, target.w_t.shape, calibration)
     texture_scan = _TextureScan(target, views, view, flows, beta, backend)
@@ -120,19 +124,14 @@ def match_prototypes(
     )
 
 
-def _match_flows(
-    scan: FlowScan, choose: Choice, iterations: int
-) -> tuple[Numbers, Numbers, Calibration, Floats]:
-    """Flow matching: candidates on the way, the last ones, and how far all flows are from theirs.
+def _match_flows(scan: FlowScan, choose: Choice, iterations: int) -> tuple[Numbers, Numbers]:
+    """Flow matching: candidates on the way, and the last ones."""
 
-    Distances (M, N) are those with the calibration on the last candidates, over their median.
-    """
-    history, chosen, _ = settle(
-        lambda candidates: choose(scan(scan.calibrate(candidates))), choose(scan())[0], iterations
-    )
-    calibration = scan.calibrate(chosen)
-    distance = scan(calibration)
-    return history, chosen, calibration, distance / _median(distance)
+    def again(chosen: Numbers) -> tuple[Numbers, float]:
+        return choose(scan(scan.calibrate(chosen)).min(axis=0))
+
+    history, chosen, _ = settle(again, choose(scan().min(axis=0))[0], iterations)
+    return history, chosen
 
 
 def settle(

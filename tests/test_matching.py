@@ -98,7 +98,7 @@ UNSEEN = SimpleNamespace(w_t=np.zeros((1, 1)), flows_b=None)
 
 
 class FlowScan:
-    """In place of the flow scan: distances (M, N) that no calibration changes."""
+    """In place of the flow scan: distances (V, M, N) that no calibration changes."""
 
     def __init__(self, distances):
         self.distances = distances
@@ -122,14 +122,14 @@ class Scan:
 
 
 def match_stubbed(monkeypatch, flow, distances, **options):
-    """`match_prototypes` with given flow distances (M, N) and texture distances."""
-    scan = Scan(distances)
-    monkeypatch.setattr(matching, "nearest_view", lambda *_: np.zeros(len(flow), int))
-    monkeypatch.setattr(matching, "FlowScan", lambda *_, **__: FlowScan(np.array(flow, float)))
+    """`match_prototypes` with given flow distances, (M, N) or (V, M, N), and texture distances."""
+    scan, flow = Scan(distances), np.array(flow, float, ndmin=3)
+    source = SimpleNamespace(images=flow[0])
+    monkeypatch.setattr(matching, "FlowScan", lambda *_, **__: FlowScan(flow))
     monkeypatch.setattr(matching, "synthetic_flows", lambda *_: None)
-    monkeypatch.setattr(matching, "texture_coordinates", lambda *_, **__: np.eye(len(flow)))
+    monkeypatch.setattr(matching, "texture_coordinates", lambda *_, **__: np.eye(flow.shape[1]))
     monkeypatch.setattr(matching, "_TextureScan", lambda *_: scan)
-    return match_prototypes(None, UNSEEN, [UNSEEN], **options), scan
+    return match_prototypes(source, UNSEEN, [UNSEEN] * len(flow), **options), scan
 
 
 def wandering(seed, count=4, frames=6):
@@ -167,6 +167,16 @@ def test_flow_alone_and_texture_alone(monkeypatch):
     alone, _ = match_stubbed(monkeypatch, flow, lambda _: texture_, balance=0.0)
     assert alone.chosen.tolist() == [1, 2]
     assert alone.history.tolist() == [[0, 1], [1, 2], [1, 2]]
+
+
+def test_prototype_and_frame_are_compared_in_the_view_that_brings_them_nearer(monkeypatch):
+    flow = [[[1.0, 2, 3], [3, 3, 2]], [[3, 0.5, 3], [1, 3, 3]]]
+    got, _ = match_stubbed(monkeypatch, flow, lambda _: np.ones((2, 3)), balance=1.0)
+    assert got.chosen.tolist() == [1, 0]
+    assert got.view.tolist() == [1, 1]
+    assert_allclose(got.flow_distance[-1], [0.5 / 1.5, 1 / 1.5])  # the median of the nearer is 1.5
+    got, _ = match_stubbed(monkeypatch, flow[::-1], lambda _: np.ones((2, 3)), fixed=[(0, 2)])
+    assert got.view.tolist() == [0, 0]
 
 
 def test_what_is_known_is_not_chosen(monkeypatch):
