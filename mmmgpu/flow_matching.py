@@ -51,13 +51,11 @@ NO_ENERGY = 1e-6  # of the first direction's: a direction with less is none
 class View:
     """A pair of reference frames, and all flows relative to them, on the pixels of their regions.
 
-    reference_a: The prototype that is A's frame of the pair.
     correspondence: S, from A's region to B's, smoothed by `SMOOTHING`.
     flows_a: of A's prototypes, (M, h, w, 2) [px].
     flows_b: of B's frames, (N, h', w', 2) [px].
     """
 
-    reference_a: int
     correspondence: Correspondence
     flows_a: F32
     flows_b: F32

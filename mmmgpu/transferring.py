@@ -181,7 +181,6 @@ class _Transfer:
         images = flows.pop(IMAGES)
         views = [
             View(
-                self.marked[kind].prototype,
                 self._correspondence(frames, kind, near, smoothing=SMOOTHING),
                 self._source_flows(kind),
                 flow,

@@ -167,7 +167,7 @@ def views_of(pair, kinds=("closed", "open"), noise=0.0, seed=0):
         points = points_of(pair, numbers[kind])
         at = [p + noise * rng.standard_normal(p.shape) for p in points]
         s = rbf_correspondence(*at, smoothing=SMOOTHING)
-        views.append(View(numbers[kind], s, pair.flows_a[kind], pair.flows_b[kind]))
+        views.append(View(s, pair.flows_a[kind], pair.flows_b[kind]))
     return views
 
 

@@ -81,7 +81,7 @@ def test_a_person_who_moves_out_of_proportion_is_calibrated(tiny):
     moved = np.empty_like(flows)
     moved[counterpart] = flows * np.float32([0.5, 1.5])
     marks = np.array([[2, 2], [19, 3], [4, 15], [18, 15.0]])
-    view = View(0, rbf_correspondence(marks, marks), flows[:20], moved)
+    view = View(rbf_correspondence(marks, marks), flows[:20], moved)
     scan = FlowScan(tiny.source, [view], backend="numpy")
     truth = counterpart[:20]
     (plain,), (exact,) = scan(), scan(scan.calibrate(truth))

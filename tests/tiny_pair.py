@@ -41,12 +41,12 @@ def tiny_pair():
         for i, (r, number) in enumerate(((a, COUNT), (b, FRAMES)))
     ]
     views = []
-    for reference in (0, 2):
+    for _ in range(2):
         marks = np.array([[2, 2], [9, 3], [18, 2], [4, 9], [11, 8], [17, 10], [6, 15], [14, 16.0]])
         marks += rng.uniform(-1, 1, marks.shape)
         moved = 1.15 * marks + rng.normal(0, 0.3, marks.shape)
         flows = (smooth_flows(rng, n, *r.shape) for r, n in ((a, COUNT), (b, FRAMES)))
-        views.append(View(reference, rbf_correspondence(marks, moved), *flows))
+        views.append(View(rbf_correspondence(marks, moved), *flows))
     source = basis_of(pictures[0], views[0].flows_a, a)
     target = basis_of(pictures[1], views[0].flows_b, b)
     return SimpleNamespace(
