@@ -211,13 +211,23 @@ def test_the_gain_of_threads_is_of_the_best_times():
     assert growth.best_of([made(5, 8, 1), made(4, 6, 2)]) == {"copy": 0.2, "scan, warp": 6}
 
 
-def test_charts_say_the_exponents(tmp_path):
+def test_charts_say_the_exponents_and_the_gain_of_threads(tmp_path):
     found = {"counts": [1, 2000], "best_ms": [1.0, 2.0], "exponent": 0.125}
     chart = tmp_path / "growth.svg"
-    draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, chart)
-    assert "warp: 0.12" in chart.read_text()
+    threads = {"counts": [1, 2, 3], "gain": {"scan, warp": [1.0, 1.9, 2.75]}}
+    draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, threads, chart)
+    drawn = chart.read_text()
+    assert "warp: 0.12" in drawn
+    assert "scan, warp: 2.75" in drawn
     with pytest.raises(InputError, match=r"must be named \.svg"):
-        draw_growth({}, tmp_path / "growth.png")
+        draw_growth({}, {}, tmp_path / "growth.png")
+
+
+@pytest.mark.parametrize(
+    ("threads", "counts"), [(1, [1]), (2, [1, 2]), (6, [1, 2, 4, 6]), (8, [1, 2, 4, 8])]
+)
+def test_threads_are_tried_in_powers_of_two_and_all(threads, counts):
+    assert growth.up_to(threads) == counts
 
 
 def test_many_frames_leave_nothing_behind(backend):
