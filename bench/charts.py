@@ -6,26 +6,48 @@ from pathlib import Path
 from mmmgpu.errors import InputError
 
 
-def draw_growth(growth, path):
-    """One chart for each axis of `bench.growth.measure_growth`, side by side, in logarithms."""
+def draw_growth(growth, threads, path):
+    """Side by side, in logarithms: one chart for each axis of growth, and one of threads.
+
+    Args:
+        growth, threads: As of `bench.growth.measure_growth` and `measure_threads`.
+        path: An .svg.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     if Path(path).suffix != ".svg":
         raise InputError(f"{path}: must be named .svg")
     with mpl.rc_context({"svg.hashsalt": "mmmgpu", "svg.fonttype": "none", "font.size": 8}):
-        figure = Figure(figsize=(3 * len(growth), 2.8), layout="constrained")
-        for axes, (axis, backends) in zip(
-            figure.subplots(1, len(growth)), growth.items(), strict=True
-        ):
+        figure = Figure(figsize=(3 * len(growth) + 3, 2.8), layout="constrained")
+        *charts, last = figure.subplots(1, len(growth) + 1)
+        for axes, (axis, backends) in zip(charts, growth.items(), strict=True):
             for name, found in backends.items():
                 label = f"{name}: {found['exponent']:.2f}"
                 axes.loglog(found["counts"], found["best_ms"], "o-", ms=3, label=label)
-            axes.set(xlabel=axis, ylabel="best time [ms]", xticks=found["counts"])
-            axes.set_xticks([], minor=True)
-            axes.set_xticklabels([short(n) for n in found["counts"]])
+            axes.set(xlabel=axis, ylabel="best time [ms]")
+            tick(axes.xaxis, found["counts"])
             axes.legend(title="exponent", frameon=False)
+        draw_threads(last, threads)
         figure.savefig(path, metadata={"Date": None})
+
+
+def draw_threads(axes, threads):
+    """How many times faster than one thread, beside what is ideal."""
+    counts = threads["counts"]
+    axes.loglog(counts, counts, "k:", lw=1)
+    for work, gain in threads["gain"].items():
+        axes.loglog(counts, gain, "o-", ms=3, label=f"{work}: {gain[-1]:.2f}")
+    axes.set(xlabel="threads", ylabel="times faster than one")
+    tick(axes.xaxis, counts)
+    tick(axes.yaxis, counts)
+    axes.legend(title="gain", frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def tick(axis, counts):
+    """Label an axis with these and nothing else."""
+    axis.set_ticks(counts, labels=[short(n) for n in counts])
+    axis.set_ticks([], minor=True)
 
 
 def short(number):

@@ -66,16 +66,20 @@ def grown(axis, name):
 
 
 def measure_threads(backends, *, rounds=2):
-    """How many times faster all threads are than one: the best times of each, and of a copy."""
-    threads = default_threads()
-    numbers = sorted({1, threads})
-    made = {n: [] for n in numbers}
+    """How many times faster more threads are than one: the best times of each, and of a copy."""
+    counts = up_to(default_threads())
+    made = {n: [] for n in counts}
     for _ in range(rounds):
-        for n in numbers:
+        for n in counts:
             made[n].append(in_a_process(backends, n))
     best = {n: best_of(results) for n, results in made.items()}
-    gains = {key: round(best[1][key] / best[threads][key], 2) for key in best[1]}
-    return {"threads": threads, "gain": gains}
+    gains = {key: [round(best[1][key] / best[n][key], 2) for n in counts] for key in best[1]}
+    return {"counts": counts, "gain": gains}
+
+
+def up_to(threads):
+    """1, 2, 4, ... and so many threads."""
+    return [*(1 << i for i in range(threads.bit_length()) if 1 << i < threads), threads]
 
 
 def in_a_process(backends, threads):

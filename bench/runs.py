@@ -19,7 +19,7 @@ from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 from mmmgpu.voices import is_installed
 
-VERSION = 1  # of the record
+VERSION = 2  # of the record; 1: short runs were not repeated
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
 
 

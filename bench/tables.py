@@ -63,8 +63,8 @@ def other_tables(results):
         ]
         yield "Growth", ("with", "by", "exponent", "counts", "best [ms]"), rows
     if threads := results.get("threads"):
-        rows = list(threads["gain"].items())
-        yield f"Gain of {threads['threads']} threads over one", ("work", "times"), rows
+        rows = [(work, times[-1]) for work, times in threads["gain"].items()]
+        yield f"Gain of {threads['counts'][-1]} threads over one", ("work", "times"), rows
     if startup := results.get("startup"):
         rows = [(name, s["empty_cache_s"], s["full_cache_s"]) for name, s in startup.items()]
         yield "First frame of a new process [s]", ("by", "empty cache", "full cache"), rows

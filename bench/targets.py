@@ -82,7 +82,7 @@ def gain(key):
 
     def value(results):
         gains = results.get("threads", {}).get("gain", {})
-        return max((gains[k] for b in BACKENDS if (k := f"{key}, {b}") in gains), default=None)
+        return max((gains[k][-1] for b in BACKENDS if (k := f"{key}, {b}") in gains), default=None)
 
     return value
 

@@ -15,6 +15,7 @@ from mmmgpu.errors import InputError
 
 REFERENCE = "reference"
 PAUSE = 0.03  # s
+LEAST = 0.01  # s: what takes less is repeated within its turn
 SLOW = 1.0  # s: what takes longer has one turn only
 
 
@@ -137,14 +138,18 @@ def take_turns(runs, effort):
 
 
 def timed(run):
-    """Seconds of one run, and of the processor for it, all threads.
+    """Seconds of one run, and of the processor for it, all threads; the mean of those of a turn.
 
-    After a pause, for the threads of the library before may still spin.
+    After a pause, for the threads of the library before may still spin. A machine that has slept
+    takes a while to wake its cores and to fill its caches: that is not what a short run takes.
     """
     time.sleep(PAUSE)
-    start, processor = time.perf_counter(), time.process_time()
-    run()
-    return time.perf_counter() - start, time.process_time() - processor
+    start, processor, runs, clock = time.perf_counter(), time.process_time(), 0, 0.0
+    while clock < LEAST:
+        run()
+        runs += 1
+        clock = time.perf_counter() - start
+    return clock / runs, (time.process_time() - processor) / runs
 
 
 def statistics(seconds, processor):

@@ -1,6 +1,7 @@
-/* Weighted sums of images, accumulated in double: 16 values a work-item, then what is left over.
+/* Weighted sums of images: 16 values a work-item, then what is left over.
  *
- * Four at a time: PoCL 3.0 compiles for CPUs without AVX-512, and warns of wider arguments.
+ * Eight terms at a time in float, which leaves at most eight roundings of theirs, and those sums in
+ * double, for any number of images. PoCL 3.0 calls its own vload and conversions as functions.
  */
 
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
@@ -8,15 +9,28 @@
 #define LANES 16
 #define BLOCK 8 /* terms summed in float */
 
+/* A vector anywhere in an image. */
+typedef float float16u __attribute__((ext_vector_type(16), aligned(4)));
+
+double4 wide(const float4 x)
+{
+    return (double4)(x.s0, x.s1, x.s2, x.s3);
+}
+
+float4 narrow(const double4 x)
+{
+    return (float4)(x.s0, x.s1, x.s2, x.s3);
+}
+
 __kernel void blend(
-    __global const float *images,   /* (M, S) */
-    __global const float *weights,  /* (batch, M) */
-    const int number,               /* M */
-    const int size,                 /* S */
+    __global const float *restrict images,   /* (M, S) */
+    __global const float *restrict weights,  /* (batch, M) */
+    const int number,                        /* M */
+    const int size,                          /* S */
     const int first,
     const int count,
     /* outputs */
-    __global float *blended)        /* (batch, S), the whole vectors of each row are written */
+    __global float *restrict blended)        /* (batch, S), the whole vectors of each row are written */
 {
     const int tid = get_global_id(0);
     if (tid >= count)
@@ -26,21 +40,17 @@ __kernel void blend(
     const int start = (first + tid) % vectors * LANES;
     double4 total[LANES / 4] = {(double4)(0.0), (double4)(0.0), (double4)(0.0), (double4)(0.0)};
     for (int begin = 0; begin < number; begin += BLOCK) {
-        float8 part[2] = {(float8)(0.0f), (float8)(0.0f)};
-        for (int m = begin; m < min(begin + BLOCK, number); ++m) {
-            const float w = weights[b * number + m];
-            if (w != 0.0f) {
-                part[0] += w * vload8(0, images + m * size + start);
-                part[1] += w * vload8(1, images + m * size + start);
-            }
-        }
-        total[0] += convert_double4(part[0].lo);
-        total[1] += convert_double4(part[0].hi);
-        total[2] += convert_double4(part[1].lo);
-        total[3] += convert_double4(part[1].hi);
+        const int end = begin + BLOCK < number ? begin + BLOCK : number;
+        float16 part = (float16)(0.0f);
+        for (int m = begin; m < end; ++m)
+            part += weights[b * number + m] * *(__global const float16u *)(images + m * size + start);
+        total[0] += wide(part.s0123);
+        total[1] += wide(part.s4567);
+        total[2] += wide(part.s89ab);
+        total[3] += wide(part.scdef);
     }
-    for (int lane = 0; lane < LANES / 4; ++lane)
-        vstore4(convert_float4(total[lane]), lane, blended + b * size + start);
+    *(__global float16u *)(blended + b * size + start) = (float16)(
+        narrow(total[0]), narrow(total[1]), narrow(total[2]), narrow(total[3]));
 }
 
 __kernel void blend_rest(

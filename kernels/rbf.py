@@ -1,7 +1,8 @@
 """A map made of Gaussians and an affine part (CE05, Eq. 6): 16 points a thread.
 
-Gaussians in float32, sums in float64. In the last thread lanes beyond the points do the last point
-again, and are not written.
+Gaussians in float32, sums in float64. Gaussians of eight terms come first, and then their sums: the
+compiler makes vectors of four of all that leads to float64. In the last thread lanes beyond the
+points do the last point again, and are not written.
 """
 
 import warp as wp
@@ -9,12 +10,14 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 LANES = 16
+BLOCK = 8
 FAR = wp.constant(3.0e38)  # squares beyond float32 stay finite: 0 times them is 0
 LEAST = wp.constant(-87.0)  # exp of it is nothing, but no denormal number
 ROUND = wp.constant(12582912.0)  # 1.5 2^23: added to a number, it leaves the nearest whole one
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16d = wp.types.vector(length=LANES, dtype=wp.float64)
 vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
+block16 = wp.types.matrix(shape=(BLOCK, LANES), dtype=wp.float32)
 
 
 @wp.func
@@ -62,14 +65,18 @@ def evaluate_rbf(
     u += wp.float64(affine[1]) * vec16d(x) + wp.float64(affine[2]) * vec16d(y)
     v = vec16d(wp.float64(affine[3]))
     v += wp.float64(affine[4]) * vec16d(x) + wp.float64(affine[5]) * vec16d(y)
-    for k in range(terms):
-        dx = x - vec16(centres[2 * k])
-        dy = y - vec16(centres[2 * k + 1])
-        square = wp.min(wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy), vec16(FAR))
-        phi = decay(-sharpness * square)
-        wide = vec16d(phi)
-        u += wp.float64(weights[2 * k]) * wide
-        v += wp.float64(weights[2 * k + 1]) * wide
+    phi = block16()
+    for begin in range(0, terms, BLOCK):
+        some = wp.min(BLOCK, terms - begin)
+        for i in range(some):
+            dx = x - vec16(centres[2 * (begin + i)])
+            dy = y - vec16(centres[2 * (begin + i) + 1])
+            square = wp.min(wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy), vec16(FAR))
+            phi[i] = decay(-sharpness * square)
+        for i in range(some):
+            wide = vec16d(phi[i])
+            u += wp.float64(weights[2 * (begin + i)]) * wide
+            v += wp.float64(weights[2 * (begin + i) + 1]) * wide
     for lane in range(wp.min(LANES, number - start)):
         mapped[2 * (start + lane)] = float(u[lane])
         mapped[2 * (start + lane) + 1] = float(v[lane])

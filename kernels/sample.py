@@ -1,7 +1,7 @@
 """Bilinear gather with the border clamped: a run of points a thread.
 
 Pictures have a kernel of their own: Warp finds the address of every element it reads anew, and a
-colour is one element.
+colour is one element. The places of a run are found as vectors first.
 """
 
 import warp as wp
@@ -9,6 +9,8 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 RUN = 16
+vec16 = wp.types.vector(length=RUN, dtype=wp.float32)
+ivec16 = wp.types.vector(length=RUN, dtype=wp.int32)
 
 
 @wp.func
@@ -81,17 +83,23 @@ def sample_pictures(
     origin = (b % fields) * height * width
     right = float(width - 1)
     bottom = float(height - 1)
-    for p in range(start, wp.min(start + RUN, number)):
-        point = points[(b % sets) * number + p]
+    fx = vec16()
+    fy = vec16()
+    step = ivec16()
+    near = ivec16()
+    far = ivec16()
+    for j in range(RUN):  # beyond the points: the last again, which is not written
+        point = points[(b % sets) * number + wp.min(start + j, number - 1)]
         x = within(point[0], right)
         y = within(point[1], bottom)
         x0 = int(x)
         y0 = int(y)
-        fx = x - float(x0)
-        fy = y - float(y0)
-        step = wp.where(x0 + 1 < width, 1, 0)
-        near = origin + y0 * width + x0
-        far = wp.where(y0 + 1 < height, near + width, near)
-        a0 = (1.0 - fx) * pictures[near] + fx * pictures[near + step]
-        a1 = (1.0 - fx) * pictures[far] + fx * pictures[far + step]
-        sampled[b * number + p] = (1.0 - fy) * a0 + fy * a1
+        fx[j] = x - float(x0)
+        fy[j] = y - float(y0)
+        step[j] = wp.where(x0 + 1 < width, 1, 0)
+        near[j] = origin + y0 * width + x0
+        far[j] = near[j] + wp.where(y0 + 1 < height, width, 0)
+    for j in range(wp.min(RUN, number - start)):
+        a0 = (1.0 - fx[j]) * pictures[near[j]] + fx[j] * pictures[near[j] + step[j]]
+        a1 = (1.0 - fx[j]) * pictures[far[j]] + fx[j] * pictures[far[j] + step[j]]
+        sampled[b * number + start + j] = (1.0 - fy[j]) * a0 + fy[j] * a1

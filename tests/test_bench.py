@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from functools import partial
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from mmmgpu.bench.kernels import kernel_work
 from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
 from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
 from mmmgpu.bench.targets import judge_targets
-from mmmgpu.bench.timing import Contender, Effort, Work, measure, take_turns
+from mmmgpu.bench.timing import LEAST, Contender, Effort, Work, measure, take_turns, timed
 from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 
@@ -99,8 +100,15 @@ def test_contenders_take_turns():
     order = []
     runs = {name: partial(order.append, name) for name in "ab"}
     seconds = take_turns(runs, Effort(turns=3, seconds=0.0))
-    assert order == list("ab" * 4)  # the first round is not counted
+    assert [name for name, _ in groupby(order)] == list("ab" * 4)  # the first round is not counted
     assert [s.shape for s in seconds.values()] == [(2, 3), (2, 3)]
+
+
+@pytest.mark.parametrize(("pause", "once"), [(0, False), (2 * LEAST, True)])
+def test_only_a_short_run_is_repeated_within_its_turn(pause, once):
+    done = []
+    timed(lambda: time.sleep(pause) or done.append(1))
+    assert (len(done) == 1) is once
 
 
 def test_the_processor_s_time_is_that_of_all_threads():
@@ -203,13 +211,23 @@ def test_the_gain_of_threads_is_of_the_best_times():
     assert growth.best_of([made(5, 8, 1), made(4, 6, 2)]) == {"copy": 0.2, "scan, warp": 6}
 
 
-def test_charts_say_the_exponents(tmp_path):
+def test_charts_say_the_exponents_and_the_gain_of_threads(tmp_path):
     found = {"counts": [1, 2000], "best_ms": [1.0, 2.0], "exponent": 0.125}
     chart = tmp_path / "growth.svg"
-    draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, chart)
-    assert "warp: 0.12" in chart.read_text()
+    threads = {"counts": [1, 2, 3], "gain": {"scan, warp": [1.0, 1.9, 2.75]}}
+    draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, threads, chart)
+    drawn = chart.read_text()
+    assert "warp: 0.12" in drawn
+    assert "scan, warp: 2.75" in drawn
     with pytest.raises(InputError, match=r"must be named \.svg"):
-        draw_growth({}, tmp_path / "growth.png")
+        draw_growth({}, {}, tmp_path / "growth.png")
+
+
+@pytest.mark.parametrize(
+    ("threads", "counts"), [(1, [1]), (2, [1, 2]), (6, [1, 2, 4, 6]), (8, [1, 2, 4, 8])]
+)
+def test_threads_are_tried_in_powers_of_two_and_all(threads, counts):
+    assert growth.up_to(threads) == counts
 
 
 def test_many_frames_leave_nothing_behind(backend):

@@ -1,12 +1,13 @@
 """Kernels kept for the next process: whole, replaced at once, and never trusted when damaged."""
 
+import os
 import zipfile
 
 import numpy as np
 import pytest
 from test_backends import ONE_OPERATION, run
 
-from mmmgpu.backends.pocl_cache import archive_path, keep, unpack
+from mmmgpu.backends.pocl_cache import archive_path, hold, keep, remove_stale, unpack
 
 
 @pytest.fixture
@@ -46,6 +47,34 @@ def test_a_place_that_cannot_be_written_costs_only_time(home):
     (home / "cache" / "mmmgpu").write_text("a file in the way")
     assert in_a_process(home)
     assert list((home / "scratch").iterdir()) == []
+
+
+def left_behind(scratch, name):
+    """The folder of a process that ended long ago."""
+    folder = scratch / name
+    folder.mkdir()
+    (folder / "a.so").write_bytes(b"x")
+    os.utime(folder, (0, 0))
+    return folder
+
+
+def test_the_next_process_removes_what_a_killed_one_has_left(home):
+    left_behind(home / "scratch", "mmmgpu-opencl-killed")
+    assert in_a_process(home)
+    assert list((home / "scratch").iterdir()) == []
+
+
+def test_folders_that_are_held_or_new_or_others_are_not_removed(tmp_path):
+    left_behind(tmp_path, "mmmgpu-opencl-killed")
+    left_behind(tmp_path, "of-something-else")
+    (tmp_path / "mmmgpu-opencl-new").mkdir()
+    held = hold(left_behind(tmp_path, "mmmgpu-opencl-held"))
+    remove_stale(tmp_path)
+    kept = {"mmmgpu-opencl-held", "mmmgpu-opencl-new", "of-something-else"}
+    assert {path.name for path in tmp_path.iterdir()} == kept
+    os.close(held)
+    remove_stale(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == kept - {"mmmgpu-opencl-held"}
 
 
 def filled(folder, *names):

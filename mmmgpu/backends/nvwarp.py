@@ -122,12 +122,14 @@ class Warp(Launches):
             wp.launch(compiled, dim=count, inputs=arguments, device=self.device, block_dim=block)
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
+        if not count:
+            return
         edges = np.linspace(0, count, min(self.threads, count) + 1).astype(int).tolist()
-        spans = [(a, b - a) for a, b in itertools.pairwise(edges)]
-        if len(spans) > 1:
-            list(_pool(self.threads).map(lambda span: work(*span), spans))
-        elif count:
-            work(0, count)
+        own, *others = [(a, b - a) for a, b in itertools.pairwise(edges)]
+        started = [_pool(self.threads).submit(work, *span) for span in others]
+        work(*own)  # one thread less to wake, which may come to share a core with another
+        for span in started:
+            span.result()
 
 
 @functools.cache

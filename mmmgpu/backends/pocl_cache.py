@@ -4,17 +4,20 @@ PoCL's own cache is not used as it is: processes that fill it at the same time r
 entry ends the process (pocl/pocl issues 430 and 1480). Here every process has a cache folder of its
 own, filled from one archive when the driver is loaded. At the end of a process that compiled
 something, its folder becomes the archive, replaced as a whole. Checksums are those of the archive:
-a damaged one counts for none. The folder is the operating system's to remove where a process was
-killed.
+a damaged one counts for none. A process holds a lock on its folder, so that the next one can tell
+what a killed one has left, and removes it.
 """
 
 import atexit
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
+import time
 import zipfile
 import zlib
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
@@ -23,6 +26,8 @@ from mmmgpu.files import atomic_path
 
 OWN = ("POCL_CACHE_DIR", "POCL_KERNEL_CACHE")  # who sets one of these has a cache of their own
 KEPT = ("*.bc", "*.so")  # programs and kernels; the rest is PoCL's scratch
+PREFIX = "mmmgpu-opencl-"  # of the folders; those of earlier versions are never locked
+NEW = 60  # s: a younger folder may not be locked yet
 UNUSED = {"POCL_KERNEL_CACHE": "0"}
 
 
@@ -30,11 +35,43 @@ def cache_variables() -> dict[str, str]:
     """The environment in which PoCL's driver is to be loaded; to be called once in a process."""
     if any(name in os.environ for name in OWN):
         return UNUSED
-    folder = Path(tempfile.mkdtemp(prefix="mmmgpu-pocl-"))
+    remove_stale(Path(tempfile.gettempdir()))
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX))
+    with suppress(OSError):
+        hold(folder)  # until the process ends
     archive = archive_path()
     known = unpack(archive, folder)
     atexit.register(keep, folder, archive, known)
     return {"POCL_CACHE_DIR": str(folder), "POCL_KERNEL_CACHE": "1"}
+
+
+def remove_stale(scratch: Path) -> None:
+    """Remove the folders in `scratch` that no process holds any more."""
+    for folder in scratch.glob(f"{PREFIX}*"):
+        with suppress(OSError):  # held, or another user's, or gone by now
+            if time.time() - folder.stat().st_mtime > NEW:
+                held = hold(folder)
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(held)
+
+
+def hold(folder: Path) -> int:
+    """Lock a folder; closing what is returned, or the end of the process, unlocks it.
+
+    Raises:
+        OSError: It is locked, or cannot be.
+    """
+    if sys.platform == "win32":
+        raise OSError("folders cannot be locked here")
+    import fcntl
+
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(held)
+        raise
+    return held
 
 
 def archive_path() -> Path:

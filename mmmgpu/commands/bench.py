@@ -54,7 +54,8 @@ def bench(
         ),
     ] = 0,
     plot: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE", help="Charts of growth, as SVG.")
+        Path | None,
+        typer.Option("--plot", metavar="FILE", help="Charts of growth and threads, as SVG."),
     ] = None,
     json: Json = None,
 ) -> None:
@@ -76,7 +77,7 @@ def bench(
     if plot is not None:
         if "growth" not in results:
             raise InputError("--plot needs --part growth")
-        draw_growth(results["growth"], plot)
+        draw_growth(results["growth"], results["threads"], plot)
     write_results(results, json)
 
 
