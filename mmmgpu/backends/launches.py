@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends.orientation import orient
-from mmmgpu.backends.planes import LANES, pitch_of, planes
+from mmmgpu.backends.planes import LANES, pitch_of
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
 COLOURS = 3  # channels of a picture, as in kernels/sample
 RUN = 16  # points of a thread, as in kernels/sample
 WHITE = 65535  # of a texture, as in kernels/prototypes
+MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
 TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
 
 
@@ -177,8 +178,9 @@ class Launches(ABC):
     def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
         number, height, width, _ = images.shape
         held = orient(flows, hole)
-        textures = planes(np.rint(images * WHITE).astype(np.uint16))
-        parts = held.fixed, held.firsts, held.deltas, held.shares
+        textures = np.ones((number, height, pitch_of(width), COLOURS + 1), np.uint16)
+        textures[:, :, :width, :COLOURS] = np.rint(images * WHITE)
+        parts = np.pad(held.flows.ravel(), LANES), held.shares, held.firsts, held.parts
         rows = held.rows, held.targets, held.starts, held.row_taps, held.row_shares
         arrays = tuple(self.to_device(a) for a in (textures, *parts, *rows))
         return Prototypes(arrays, number, height, width, held.nodes, float(hole))
@@ -204,19 +206,24 @@ class Launches(ABC):
             return mixed
         workers = min(self.workers, mixtures)
         size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
+        ring = 1 << (held.height - 1).bit_length()
         arrived = self.empty(mixtures, dtype=np.int32)
         given = zip(members, (np.int32, np.int32, np.float32), strict=True)
         inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
-        inputs += [frames, mixtures, held.height, held.width, size, held.nodes, held.hole, workers]
+        inputs += [frames, mixtures, held.height, held.width, size, ring, held.nodes, held.hole]
         outputs = [
-            self.empty(workers, 4, held.height * pitch + 2 * (pitch + 2 * LANES)),
-            self.empty(workers, 4, size),
+            self.empty(workers, ring, pitch + MARGIN, COLOURS + 1),
+            self.empty(workers, COLOURS + 1, size),
+            self.empty(workers, 2, held.height * pitch + LANES),
             self.empty(workers, 2, held.nodes),
-            self.empty(workers, 2, held.height, pitch),
+            self.empty(workers, held.height + 1, dtype=np.int32),
+            self.empty(workers, 2, pitch, dtype=np.int32),
+            self.empty(workers, 7, pitch),
+            self.empty(workers, held.height, pitch, dtype=np.int32),
             mixed,
             arrived,
         ]
-        self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
+        self.launch_all("prototypes.mix_prototypes", workers, [*inputs, workers], outputs)
         check_some_valid(self.to_host(arrived))
         return mixed
 
