@@ -49,17 +49,21 @@ def orient(
     area: int,
     pitch: int,
     nodes: int,
+    together: int,
     field: wp.array[float],
     there: int,
     residual: wp.array[float],
     here: int,
 ):
-    """The flow that is missing to prototype `m`, for each of its pixels."""
+    """The flow that is missing to prototype `m`, for each of its pixels, in one frame or two."""
     vectors = area / LANES
+    next = there + 2 * (area + LANES)
     for v in range(vectors):
         i = LANES * v
         x = vec16()
         y = vec16()
+        next_x = vec16()
+        next_y = vec16()
         for k in range(firsts[m * vectors + v], firsts[m * vectors + v + 1]):
             part = neighbours[k]
             s = i + part[1] * pitch + part[0]
@@ -68,14 +72,19 @@ def orient(
             share = given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
             x += wp.cw_mul(share, get(field, there + s) - qx)
             y += wp.cw_mul(share, get(field, there + area + s) - qy)
+            if together > 1:
+                next_x += wp.cw_mul(share, get(field, next + s) - qx)
+                next_y += wp.cw_mul(share, get(field, next + area + s) - qy)
         share = get(shares, m * area + i)
         put(residual, here + i, wp.cw_mul(share, x))
         put(residual, here + nodes + i, wp.cw_mul(share, y))
-    for row in range(rows[m], rows[m + 1]):
-        right = float(0.0)
-        down = float(0.0)
-        for j in range(starts[row], starts[row + 1]):
-            right += row_shares[j] * residual[here + row_taps[j]]
-            down += row_shares[j] * residual[here + nodes + row_taps[j]]
-        residual[here + targets[row]] = right
-        residual[here + nodes + targets[row]] = down
+        if together > 1:
+            put(residual, here + 2 * nodes + i, wp.cw_mul(share, next_x))
+            put(residual, here + 3 * nodes + i, wp.cw_mul(share, next_y))
+    for plane in range(2 * together):
+        at = here + plane * nodes
+        for row in range(rows[m], rows[m + 1]):
+            sum = float(0.0)
+            for j in range(starts[row], starts[row + 1]):
+                sum += row_shares[j] * residual[at + row_taps[j]]
+            residual[at + targets[row]] = sum

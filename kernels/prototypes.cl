@@ -1,8 +1,8 @@
 /* Prototypes moved along flows of the model and mixed: CE05, Eq. 2 in one launch.
  *
- * A worker takes one prototype of one frame after the other: the flow that is missing to it is carried
- * to its pixels (orientation), and these along that flow into sums that belong to the worker alone
- * (rings). Flows are planes, one a direction, with rows padded to whole vectors; a padded row is a
+ * A worker takes one prototype after the other of a group of one mixture or two: the flow that is
+ * missing to it is carried to its pixels (orientation), for both at once, and these along that flow into
+ * sums that belong to the worker alone (rings). Flows are planes, one a direction, with rows padded to whole vectors; a padded row is a
  * pitch.
  */
 
@@ -25,12 +25,13 @@ __kernel void mix_prototypes(
     __global const int *starts,        /* (rows + 1) its first tap */
     __global const int *row_taps,      /* pixels or cells, of rows before */
     __global const float *row_shares,
-    __global const int *parts,         /* (mixtures + 1) first member of each mixture */
-    __global const int *members,       /* (parts[mixtures]) prototypes */
-    __global const float *weights,     /* (parts[mixtures]) their weights */
+    __global const int *parts,         /* (groups + 1) first member of each group */
+    __global const int *members,       /* (parts[groups]) prototypes */
+    __global const float *weights,     /* (parts[groups], together) their weights, 0 for none */
     __global const float *scale,       /* (H, pitch) of what is written; 0 where nothing is asked */
     const int frames,
     const int mixtures,
+    const int together,                /* mixtures of a group: 1 or 2 */
     const int height,
     const int width,
     const int size,                    /* of a pyramid without its finest level */
@@ -43,8 +44,8 @@ __kernel void mix_prototypes(
     /* outputs */
     __global float *total,             /* (workers, ring, pitch + 40, 4) scratch: sums */
     __global float *cells,             /* (workers, 4 size) scratch */
-    __global float *field,             /* (workers, 2, H * pitch + 16) scratch */
-    __global float *residual,          /* (workers, 2, nodes) scratch */
+    __global float *field,             /* (workers, together, 2, H * pitch + 16) scratch */
+    __global float *residual,          /* (workers, together, 2, nodes) scratch */
     __global int *opens,               /* (workers, H + 1) scratch */
     __global int *places,              /* (workers, 2, pitch) scratch */
     __global float *steps,             /* (workers, 7, pitch) scratch */
@@ -61,8 +62,8 @@ __kernel void mix_prototypes(
     const int row = COLOUR * (pitch + MARGIN);
     total += worker * ring * row;
     cells += 4 * worker * size;
-    field += 2 * worker * (area + LANES);
-    residual += 2 * worker * nodes;
+    field += 2 * together * worker * (area + LANES);
+    residual += 2 * together * worker * nodes;
     opens += worker * (height + 1);
     places += 2 * worker * pitch;
     steps += 7 * worker * pitch;
@@ -71,41 +72,36 @@ __kernel void mix_prototypes(
         total[i] = 0.0f;
     for (int i = 0; i < 4 * size; ++i)
         cells[i] = 0.0f;
-    for (int i = 0; i < 2 * (area + LANES); ++i)
+    for (int i = 0; i < 2 * together * (area + LANES); ++i)
         field[i] = 0.0f;
     field += LANES;
     own += LANES;
-    for (int job = worker; job < mixtures; job += workers) {
-        __global float *out = mixed + 3 * job * area;
-        if (frames > 1 || job == worker)
-            for (int i = 0; i < 2 * area; ++i)
-                field[i] = flows[2 * (job % frames) * area + i];
-        arrived[job] = 1;
-        if (parts[job] == parts[job + 1])
+    for (int group = worker; together * group < mixtures; group += workers) {
+        const int job = together * group;
+        const int number = together < mixtures - job ? together : mixtures - job;
+        for (int f = 0; f < number; ++f) {
+            __global float *to = field + 2 * f * (area + LANES);
+            __global const float *from = flows + 2 * ((job + f) % frames) * area;
+            if (frames > 1 || group == worker)
+                for (int i = 0; i < 2 * area; ++i)
+                    to[i] = from[i];
             for (int i = 0; i < 3 * area; ++i)
-                out[i] = 0.0f;
-        for (int part = parts[job]; part < parts[job + 1]; ++part) {
+                mixed[3 * (job + f) * area + i] = 0.0f;
+            arrived[job + f] = 1;
+        }
+        for (int part = parts[group]; part < parts[group + 1]; ++part) {
             const int m = members[part];
-            const float weight = weights[part] / WHITE;
             orient(m, own, shares, firsts, neighbours, rows, targets, starts, row_taps, row_shares,
-                   area, pitch, nodes, field, residual);
-            const int used = reach(residual + nodes, height, pitch, opens);
-            int shown = 0;
-            int found = 0;
-            for (int y = 0; y <= height; ++y) {
-                for (; shown < opens[y]; ++shown)
-                    found = show(total + (shown & (used - 1)) * row, shown, height, width, pitch,
-                                 hole, weight, scale, part > parts[job], out, cells, holes, found);
-                if (y < height) {
-                    aim(textures + COLOUR * (m * area + y * pitch) / LANES, y, height, width, pitch,
-                        residual + y * pitch, residual + nodes + y * pitch, used, places, steps);
-                    splat(pitch, places, steps, total);
-                }
+                   area, pitch, nodes, number, field, residual);
+            for (int f = 0; f < number; ++f) {
+                const float weight = weights[together * part + f] / WHITE;
+                __global const float *right = residual + 2 * f * nodes;
+                if (weight != 0.0f &&
+                    carry(textures + COLOUR * m * area / LANES, height, width, pitch, right,
+                          right + nodes, hole, weight, scale, total, cells, opens, places, steps,
+                          holes, mixed + 3 * (job + f) * area) == 0)
+                    arrived[job + f] = 0;
             }
-            if (found > 0 && fill(cells, (height + 1) / 2, (width + 1) / 2))
-                mend(holes, found, height, width, pitch, weight, scale, cells, out);
-            else if (found > 0)
-                arrived[job] = 0;
         }
     }
 }

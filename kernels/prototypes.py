@@ -1,9 +1,9 @@
 """Prototypes moved along flows of the model and mixed: CE05, Eq. 2 in one launch.
 
-A worker takes one prototype of one frame after the other: the flow that is missing to it is carried
-to its pixels (orientation), and these along that flow into sums that belong to the worker alone
-(rings). Flows are planes, one a direction, with rows padded to whole vectors; a padded row is a
-pitch.
+A worker takes one prototype after the other of a group of one mixture or two: the flow that is
+missing to it is carried to its pixels (orientation), for both at once, and these along that flow
+into sums that belong to the worker alone (rings). Flows are planes, one a direction, with rows
+padded to whole vectors; a padded row is a pitch.
 """
 
 import warp as wp
@@ -17,8 +17,7 @@ from mmmgpu.kernels.lanes import (
     vec16,
 )
 from mmmgpu.kernels.orientation import orient
-from mmmgpu.kernels.pyramid import fill
-from mmmgpu.kernels.rings import COLOUR, MARGIN, aim, mend, reach, show, splat
+from mmmgpu.kernels.rings import COLOUR, MARGIN, carry
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,12 +37,13 @@ def mix_prototypes(
     starts: wp.array[int],  # (rows + 1) its first tap
     row_taps: wp.array[int],  # pixels or cells, of rows before
     row_shares: wp.array[float],
-    parts: wp.array[int],  # (mixtures + 1) first member of each mixture
-    members: wp.array[int],  # (parts[mixtures]) prototypes
-    weights: wp.array[float],  # (parts[mixtures]) their weights
+    parts: wp.array[int],  # (groups + 1) first member of each group
+    members: wp.array[int],  # (parts[groups]) prototypes
+    weights: wp.array[float],  # (parts[groups], together) their weights, 0 for none
     scale: wp.array[float],  # (H, pitch) of what is written; 0 where nothing is asked for
     frames: int,
     mixtures: int,
+    together: int,  # mixtures of a group: 1 or 2
     height: int,
     width: int,
     size: int,  # of a pyramid without its finest level
@@ -56,8 +56,8 @@ def mix_prototypes(
     # outputs
     total: wp.array[float],  # (workers, ring, pitch + 40, 4) scratch: sums
     cells: wp.array[float],  # (workers, 4 size) scratch
-    field: wp.array[float],  # (workers, 2, H * pitch + 16) scratch
-    residual: wp.array[float],  # (workers, 2, nodes) scratch
+    field: wp.array[float],  # (workers, together, 2, H * pitch + 16) scratch
+    residual: wp.array[float],  # (workers, together, 2, nodes) scratch
     opens: wp.array[int],  # (workers, H + 1) scratch
     places: wp.array[int],  # (workers, 2, pitch) scratch
     steps: wp.array[float],  # (workers, 7, pitch) scratch
@@ -74,9 +74,8 @@ def mix_prototypes(
     row = COLOUR * (pitch + MARGIN)
     here = worker * ring * row
     cell = 4 * worker * size
-    there = 2 * worker * (area + LANES) + LANES
-    right = 2 * worker * nodes
-    down = right + nodes
+    there = 2 * together * worker * (area + LANES) + LANES
+    missing = 2 * together * worker * nodes
     open = worker * (height + 1)
     place = 2 * worker * pitch
     step = 7 * worker * pitch
@@ -85,21 +84,21 @@ def mix_prototypes(
         total[here + i] = 0.0
     for i in range(4 * size):
         cells[cell + i] = 0.0
-    for i in range(2 * (area + LANES)):
+    for i in range(2 * together * (area + LANES)):
         field[there - LANES + i] = 0.0
-    for job in range(worker, mixtures, workers):
-        out = 3 * job * area
-        if frames > 1 or job == worker:
-            for i in range(0, 2 * area, LANES):
-                put(field, there + i, get(flows, 2 * (job % frames) * area + i))
-        arrived[job] = 1
-        if parts[job] == parts[job + 1]:
+    for group in range(worker, (mixtures + together - 1) / together, workers):
+        job = together * group
+        number = wp.min(together, mixtures - job)
+        for f in range(number):
+            if frames > 1 or group == worker:
+                to = there + 2 * f * (area + LANES)
+                for i in range(0, 2 * area, LANES):
+                    put(field, to + i, get(flows, 2 * ((job + f) % frames) * area + i))
             for i in range(0, 3 * area, LANES):
-                put(mixed, out + i, vec16())
-        for part in range(parts[job], parts[job + 1]):
+                put(mixed, 3 * (job + f) * area + i, vec16())
+            arrived[job + f] = 1
+        for part in range(parts[group], parts[group + 1]):
             m = members[part]
-            weight = weights[part] / WHITE
-            more = wp.where(part > parts[job], 1, 0)
             orient(
                 m,
                 own,
@@ -114,69 +113,42 @@ def mix_prototypes(
                 area,
                 pitch,
                 nodes,
+                number,
                 field,
                 there,
                 residual,
-                right,
+                missing,
             )
-            used = reach(residual, down, height, pitch, opens, open)
-            shown = int(0)
-            found = int(0)
-            for y in range(height + 1):
-                while shown < opens[open + y]:
-                    found = show(
-                        total,
-                        here + (shown & (used - 1)) * row,
-                        shown,
-                        height,
-                        width,
-                        pitch,
-                        hole,
-                        weight,
-                        scale,
-                        more,
-                        mixed,
-                        out,
-                        cells,
-                        cell,
-                        holes,
-                        list,
-                        found,
-                    )
-                    shown += 1
-                if y < height:
-                    aim(
+            for f in range(number):
+                weight = weights[together * part + f] / WHITE
+                if weight != 0.0:
+                    right = missing + 2 * f * nodes
+                    some = carry(
                         textures,
-                        COLOUR * (m * area + y * pitch) / LANES,
-                        y,
+                        COLOUR * m * area / LANES,
                         height,
                         width,
                         pitch,
                         residual,
-                        right + y * pitch,
-                        down + y * pitch,
-                        used,
+                        right,
+                        right + nodes,
+                        hole,
+                        weight,
+                        scale,
+                        total,
+                        here,
+                        cells,
+                        cell,
+                        opens,
+                        open,
                         places,
                         place,
                         steps,
                         step,
-                    )
-                    splat(pitch, places, place, steps, step, total, here)
-            if found > 0:
-                if fill(cells, cell, (height + 1) / 2, (width + 1) / 2) == 1:
-                    mend(
                         holes,
                         list,
-                        found,
-                        height,
-                        width,
-                        pitch,
-                        weight,
-                        scale,
-                        cells,
-                        cell,
                         mixed,
-                        out,
+                        3 * (job + f) * area,
                     )
-                else:
-                    arrived[job] = 0
+                    if some == 0:
+                        arrived[job + f] = 0

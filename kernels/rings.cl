@@ -90,10 +90,9 @@ void splat(const int pitch, __global const int *places, __global const float *st
         }
 }
 
-/* Add to one channel of a picture, or begin it. */
-void add(__global float *out, const float16 v, const int more)
+void add(__global float *out, const float16 v)
 {
-    put(out, more ? get(out) + v : v);
+    put(out, get(out) + v);
 }
 
 /* Add half of the sums over blocks of 2 x 2, or begin them. */
@@ -103,13 +102,13 @@ void add_pairs(__global float *cell, const float16 v, const int more)
     *(__global float8u *)cell = more ? *(__global float8u *)cell + sum : sum;
 }
 
-/* Write the means of row y, or add them, and empty their sums; begin the pyramid.
+/* Add the means of row y to a picture and empty their sums; begin the pyramid.
  *
  * Pixels that are asked for and received too little go to the list of holes, of which there are
  * `found`. Returns how many there are then.
  */
 int show(__global float *total, const int y, const int h, const int w, const int pitch,
-         const float hole, const float weight, __global const float *scale, const int more,
+         const float hole, const float weight, __global const float *scale,
          __global float *out, __global float *cells, __global int *holes, int found)
 {
     const int area = h * pitch;
@@ -136,9 +135,9 @@ int show(__global float *total, const int y, const int h, const int w, const int
                 if (lacks[j])
                     holes[found++] = i + j;
         const float16 part = weight * asked;
-        add(out + i, part * red, more);
-        add(out + area + i, part * green, more);
-        add(out + 2 * area + i, part * blue, more);
+        add(out + i, part * red);
+        add(out + area + i, part * green);
+        add(out + 2 * area + i, part * blue);
         __global float *cell = cells + y / 2 * across + x / 2;
         add_pairs(cell, red, y % 2);
         add_pairs(cell + step, green, y % 2);
@@ -160,4 +159,32 @@ void mend(__global const int *holes, const int found, const int h, const int w, 
         out[h * pitch + i] += colour.y;
         out[2 * h * pitch + i] += colour.z;
     }
+}
+
+/* Add a prototype, carried along a flow, to a picture. Returns 0 where nothing of it arrives. */
+int carry(__global const ushort16 *texture, const int h, const int w, const int pitch,
+          __global const float *right, __global const float *down, const float hole,
+          const float weight, __global const float *scale, __global float *total,
+          __global float *cells, __global int *opens, __global int *places, __global float *steps,
+          __global int *holes, __global float *out)
+{
+    const int ring = reach(down, h, pitch, opens);
+    int shown = 0;
+    int found = 0;
+    for (int y = 0; y <= h; ++y) {
+        for (; shown < opens[y]; ++shown)
+            found = show(total + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN), shown, h, w,
+                         pitch, hole, weight, scale, out, cells, holes, found);
+        if (y < h) {
+            aim(texture + COLOUR * y * pitch / LANES, y, h, w, pitch, right + y * pitch,
+                down + y * pitch, ring, places, steps);
+            splat(pitch, places, steps, total);
+        }
+    }
+    if (found == 0)
+        return 1;
+    if (fill(cells, (h + 1) / 2, (w + 1) / 2) == 0)
+        return 0;
+    mend(holes, found, h, w, pitch, weight, scale, cells, out);
+    return 1;
 }

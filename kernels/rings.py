@@ -30,7 +30,7 @@ from mmmgpu.kernels.lanes import (
     whole,
     within,
 )
-from mmmgpu.kernels.pyramid import between
+from mmmgpu.kernels.pyramid import between, fill
 
 wp.set_module_options({"enable_backward": False})
 
@@ -166,11 +166,8 @@ def known(share: vec16):
 
 
 @wp.func
-def add(out: wp.array[float], i: int, v: vec16, more: int):
-    """Add to one channel of a picture, or begin it."""
-    if more == 1:
-        v += get(out, i)
-    put(out, i, v)
+def add(out: wp.array[float], i: int, v: vec16):
+    put(out, i, get(out, i) + v)
 
 
 @wp.func
@@ -195,7 +192,6 @@ def show(
     hole: float,
     weight: float,
     scale: wp.array[float],
-    more: int,
     out: wp.array[float],
     start: int,
     cells: wp.array[float],
@@ -204,7 +200,7 @@ def show(
     list: int,
     found: int,
 ):
-    """Write the means of row `y`, or add them, and empty their sums; begin the pyramid.
+    """Add the means of row `y` to a picture and empty their sums; begin the pyramid.
 
     Pixels that are asked for and received too little go to the list of holes, of which there are
     `found`. Returns how many there are then.
@@ -233,9 +229,9 @@ def show(
                     holes[list + number] = i + j
                     number += 1
         part = weight * asked
-        add(out, start + i, wp.cw_mul(part, red), more)
-        add(out, start + area + i, wp.cw_mul(part, green), more)
-        add(out, start + 2 * area + i, wp.cw_mul(part, blue), more)
+        add(out, start + i, wp.cw_mul(part, red))
+        add(out, start + area + i, wp.cw_mul(part, green))
+        add(out, start + 2 * area + i, wp.cw_mul(part, blue))
         at = cell + y / 2 * across + x / 2
         add_pairs(cells, at, red, y % 2)
         add_pairs(cells, at + step, green, y % 2)
@@ -265,3 +261,83 @@ def mend(
         colour = weight * scale[i] * between(cells, cell, h, w, i / pitch, i % pitch)
         for c in range(3):
             out[start + c * h * pitch + i] += colour[c]
+
+
+@wp.func
+def carry(
+    textures: wp.array[uvec16],
+    texture: int,
+    h: int,
+    w: int,
+    pitch: int,
+    residual: wp.array[float],
+    right: int,
+    down: int,
+    hole: float,
+    weight: float,
+    scale: wp.array[float],
+    total: wp.array[float],
+    here: int,
+    cells: wp.array[float],
+    cell: int,
+    opens: wp.array[int],
+    open: int,
+    places: wp.array[int],
+    place: int,
+    steps: wp.array[float],
+    step: int,
+    holes: wp.array[int],
+    list: int,
+    out: wp.array[float],
+    start: int,
+):
+    """Add a prototype, carried along a flow, to a picture. Returns 0 where nothing arrives."""
+    ring = reach(residual, down, h, pitch, opens, open)
+    shown = int(0)
+    found = int(0)
+    for y in range(h + 1):
+        while shown < opens[open + y]:
+            t = here + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN)
+            found = show(
+                total,
+                t,
+                shown,
+                h,
+                w,
+                pitch,
+                hole,
+                weight,
+                scale,
+                out,
+                start,
+                cells,
+                cell,
+                holes,
+                list,
+                found,
+            )
+            shown += 1
+        if y < h:
+            aim(
+                textures,
+                texture + COLOUR * y * pitch / LANES,
+                y,
+                h,
+                w,
+                pitch,
+                residual,
+                right + y * pitch,
+                down + y * pitch,
+                ring,
+                places,
+                place,
+                steps,
+                step,
+            )
+            splat(pitch, places, place, steps, step, total, here)
+    if found == 0:
+        return 1
+    if fill(cells, cell, (h + 1) / 2, (w + 1) / 2) == 0:
+        return 0
+    mend(holes, list, found, h, w, pitch, weight, scale, cells, cell, out, start)
+    return 1

@@ -187,35 +187,48 @@ class Launches(ABC):
 
     def move_prototypes(self, held: Prototypes, flow: Any, used: Any, scale: Any) -> Any:
         members = self.to_host(used)
-        alone = [np.arange(len(members) + 1), members, np.ones(len(members))]
-        return self._mixtures(held, flow, 1, alone, scale)
+        alone = [np.arange(len(members) + 1), members, np.ones((len(members), 1))]
+        return self._mixtures(held, flow, 1, len(members), alone, scale)
 
     def mix_prototypes(self, held: Prototypes, flows: Any, weights: Any, scale: Any) -> Any:
         shares = self.to_host(weights)
-        parts = np.concatenate([[0], np.cumsum(np.count_nonzero(shares, axis=1))])
-        members = [parts, np.nonzero(shares)[1], shares[shares != 0]]
-        return self._mixtures(held, flows, len(shares), members, scale)
+        mixtures, number = shares.shape
+        together = 2 if mixtures >= 2 * self.workers else 1
+        groups = math.ceil(mixtures / together)
+        padded = np.zeros((groups, together, number), np.float32)
+        padded.reshape(-1, number)[:mixtures] = shares
+        used = padded.any(axis=1)
+        parts = np.concatenate([[0], np.cumsum(np.count_nonzero(used, axis=1))])
+        members = [parts, np.nonzero(used)[1], padded.transpose(0, 2, 1)[used]]
+        return self._mixtures(held, flows, mixtures, mixtures, members, scale)
 
     def _mixtures(
-        self, held: Prototypes, flows: Any, frames: int, members: list[Any], scale: Any
+        self,
+        held: Prototypes,
+        flows: Any,
+        frames: int,
+        mixtures: int,
+        members: list[Any],
+        scale: Any,
     ) -> Any:
         """Run kernels/prototypes with an accumulator for every worker."""
-        mixtures, pitch = len(members[0]) - 1, pitch_of(held.width)
+        pitch, together = pitch_of(held.width), members[2].shape[1]
         mixed = self.empty(mixtures, 3, held.height, pitch)
         if not mixtures:
             return mixed
-        workers = min(self.workers, mixtures)
+        workers = min(self.workers, len(members[0]) - 1)
         size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
         ring = 1 << (held.height - 1).bit_length()
         arrived = self.empty(mixtures, dtype=np.int32)
         given = zip(members, (np.int32, np.int32, np.float32), strict=True)
         inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
-        inputs += [frames, mixtures, held.height, held.width, size, ring, held.nodes, held.hole]
+        inputs += [frames, mixtures, together, held.height, held.width, size, ring, held.nodes]
+        inputs += [held.hole, workers]
         outputs = [
             self.empty(workers, ring, pitch + MARGIN, COLOURS + 1),
             self.empty(workers, COLOURS + 1, size),
-            self.empty(workers, 2, held.height * pitch + LANES),
-            self.empty(workers, 2, held.nodes),
+            self.empty(workers, together, 2, held.height * pitch + LANES),
+            self.empty(workers, together, 2, held.nodes),
             self.empty(workers, held.height + 1, dtype=np.int32),
             self.empty(workers, 2, pitch, dtype=np.int32),
             self.empty(workers, 7, pitch),
@@ -223,7 +236,7 @@ class Launches(ABC):
             mixed,
             arrived,
         ]
-        self.launch_all("prototypes.mix_prototypes", workers, [*inputs, workers], outputs)
+        self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
         check_some_valid(self.to_host(arrived))
         return mixed
 
