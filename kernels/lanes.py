@@ -32,24 +32,35 @@ def put(values: wp.array[float], i: int, v: vec16):
 
 
 @wp.func
-def get_one(values: wp.array[float], i: int):
-    """values[i], without its stride."""
-    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=float)
+def address(values: wp.array[float], i: int):
+    """Of values[i]: for loops in which to find those of many arrays would take most of the time."""
+    return values.ptr + wp.uint64(4) * wp.uint64(i)
+
+
+@wp.func
+def one_at(address: wp.uint64):
+    here = wp.array(ptr=address, shape=(1,), dtype=float)
     return here[0]
 
 
 @wp.func
-def get_place(values: wp.array[int], i: int):
-    """values[i], without its stride."""
-    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=int)
+def place_at(address: wp.uint64):
+    here = wp.array(ptr=address, shape=(1,), dtype=int)
     return here[0]
 
 
 @wp.func
-def get_colour(values: wp.array[float], i: int):
-    """The vector of values i ... i + 3."""
-    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=wp.vec4)
+def colour_at(address: wp.uint64):
+    """The vector of 4 values there."""
+    here = wp.array(ptr=address, shape=(1,), dtype=wp.vec4)
     return here[0]
+
+
+@wp.func
+def add_at(address: wp.uint64, v: vec8):
+    """Add to the vector of 8 values there."""
+    here = wp.array(ptr=address, shape=(1,), dtype=vec8)
+    here[0] = here[0] + v
 
 
 @wp.func

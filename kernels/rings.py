@@ -10,16 +10,18 @@ import warp as wp
 from mmmgpu.kernels.lanes import (
     HALF,
     LANES,
+    add_at,
+    address,
+    colour_at,
     colours,
     fraction,
     get,
-    get_colour,
     get_half,
-    get_one,
-    get_place,
     ivec16,
     least,
+    one_at,
     pitch_of,
+    place_at,
     put,
     put_half,
     put_whole,
@@ -128,20 +130,28 @@ def splat(
     here: int,
 ):
     """Add the pixels of a row, each to the four around where it arrives."""
+    row = wp.uint64(4) * wp.uint64(pitch)
+    sums = address(total, here)
+    across = address(steps, step)
+    above = across + row
+    below = above + row
+    colours = below + row
+    uppers = places.ptr + wp.uint64(4) * wp.uint64(place)
+    lowers = uppers + row
     for first in range(APART):
-        for i in range(first, pitch, APART):
-            colour = get_colour(steps, step + 3 * pitch + COLOUR * i)
-            fx = get_one(steps, step + i)
+        i = wp.uint64(4) * wp.uint64(first)
+        while i < row:
+            colour = colour_at(colours + wp.uint64(4) * i)
+            fx = one_at(across + i)
             both = vec8()
             for k in range(COLOUR):
                 both[k] = colour[k] * (1.0 - fx)
                 both[k + COLOUR] = colour[k] * fx
-            upper = here + get_place(places, place + i)
-            lower = here + get_place(places, place + pitch + i)
-            fy = get_one(steps, step + 2 * pitch + i)
-            gy = get_one(steps, step + pitch + i)
-            put_half(total, upper, get_half(total, upper) + gy * both)
-            put_half(total, lower, get_half(total, lower) + fy * both)
+            upper = wp.uint64(place_at(uppers + i))
+            lower = wp.uint64(place_at(lowers + i))
+            add_at(sums + wp.uint64(4) * upper, one_at(above + i) * both)
+            add_at(sums + wp.uint64(4) * lower, one_at(below + i) * both)
+            i += wp.uint64(4) * wp.uint64(APART)
 
 
 @wp.func
@@ -223,7 +233,10 @@ def show(
         blue = wp.cw_mul(share, channel(a, b, c, d, 2))
         i = y * pitch + x
         asked = get(scale, i)
-        if wp.min(share) == 0.0:
+        lacks = int(0)
+        for j in range(LANES):
+            lacks += wp.where(share[j] == 0.0 and asked[j] > 0.0, 1, 0)
+        if lacks > 0:
             for j in range(LANES):
                 if share[j] == 0.0 and asked[j] > 0.0:
                     holes[list + number] = i + j
