@@ -83,11 +83,13 @@ void complete(__global float *cells, const int height, const int width, const in
         const int pitch = pitch_of(w);
         const int step = h * pitch;
         for (int y = 0; y < h; ++y)
-            for (int x = 0; x < w; ++x) {
-                const int i = y * pitch + x;
-                if (at[i + 3 * step] == 0.0f)
-                    set_cell(at, i, step, between(at + 4 * step, h, w, y, x));
-            }
+            for (int first = 0; first < w; first += LANES)
+                if (least_value(get(at + 3 * step + y * pitch + first)) == 0.0f)
+                    for (int x = first; x < first + LANES && x < w; ++x) {
+                        const int i = y * pitch + x;
+                        if (at[i + 3 * step] == 0.0f)
+                            set_cell(at, i, step, between(at + 4 * step, h, w, y, x));
+                    }
     }
 }
 
