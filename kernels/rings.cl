@@ -5,7 +5,7 @@
  * received too little are listed, and filled by pull-push in the end.
  */
 
-#define APART 4       /* pixels splatted one after the other: neighbours would wait for each other */
+#define APART 4       /* between pixels splatted in turn: neighbours would wait for each other */
 #define COLOUR 4      /* floats of a pixel: red, green, blue, weight */
 #define LEFT 4        /* pixels of a row of sums before the picture; the first two are nowhere */
 #define MARGIN 40     /* pixels of a row of sums beside the picture */

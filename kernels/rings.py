@@ -36,7 +36,7 @@ from mmmgpu.kernels.pyramid import between, fill
 
 wp.set_module_options({"enable_backward": False})
 
-APART = wp.constant(4)  # pixels splatted one after the other: neighbours would wait for each other
+APART = wp.constant(4)  # between pixels splatted in turn: neighbours would wait for each other
 COLOUR = 4  # floats of a pixel: red, green, blue, weight
 LEFT = wp.constant(4)  # pixels of a row of sums before the picture; the first two are nowhere
 MARGIN = wp.constant(40)  # pixels of a row of sums beside the picture
