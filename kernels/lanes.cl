@@ -9,8 +9,11 @@
 #define LANES 16
 #define LANE ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 
-/* A vector anywhere in a plane. */
+/* Vectors anywhere in a plane. */
+typedef float float4u __attribute__((ext_vector_type(4), aligned(4)));
+typedef float float8u __attribute__((ext_vector_type(8), aligned(4)));
 typedef float float16u __attribute__((ext_vector_type(16), aligned(4)));
+typedef int int16u __attribute__((ext_vector_type(16), aligned(4)));
 
 float16 get(__global const float *p)
 {
@@ -20,6 +23,11 @@ float16 get(__global const float *p)
 void put(__global float *p, const float16 v)
 {
     *(__global float16u *)p = v;
+}
+
+void put_whole(__global int *p, const int16 n)
+{
+    *(__global int16u *)p = n;
 }
 
 int pitch_of(const int width)
@@ -40,12 +48,6 @@ int16 whole(const float16 q)
     return n + (convert_float16(n) > q);
 }
 
-/* The shares of what arrives within a side of the picture, else 0. */
-float16 inside(const float16 share, const int16 place, const int size)
-{
-    return (place >= 0 & place < size) ? share : (float16)0.0f;
-}
-
 int least(const int16 n)
 {
     const int8 a = n.lo < n.hi ? n.lo : n.hi;
@@ -60,12 +62,6 @@ float least_value(const float16 n)
     const float4 b = a.lo < a.hi ? a.lo : a.hi;
     const float2 c = b.lo < b.hi ? b.lo : b.hi;
     return c.x < c.y ? c.x : c.y;
-}
-
-float16 one_later(const float16 v)
-{
-    return (float16)(0.0f, v.s0, v.s1, v.s2, v.s3, v.s4, v.s5, v.s6, v.s7, v.s8, v.s9, v.sa, v.sb,
-                     v.sc, v.sd, v.se);
 }
 
 /* One over the weight where it is enough, else 0. */

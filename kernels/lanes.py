@@ -11,9 +11,9 @@ wp.set_module_options({"enable_backward": False})
 FAR = wp.constant(1.0e8)  # [px] beyond any picture, inside int32
 HUGE = wp.constant(1.0e30)
 LANES = 16
-LAST = 15  # lane
 HALF = 8  # lanes
 vec16 = wp.types.vector(length=LANES, dtype=float)
+vec8 = wp.types.vector(length=HALF, dtype=float)
 ivec16 = wp.types.vector(length=LANES, dtype=int)
 uvec16 = wp.types.vector(length=LANES, dtype=wp.uint16)
 
@@ -29,6 +29,57 @@ def get(values: wp.array[float], i: int):
 def put(values: wp.array[float], i: int, v: vec16):
     here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec16)
     here[0] = v
+
+
+@wp.func
+def address(values: wp.array[float], i: int):
+    """Of values[i]: for loops in which to find those of many arrays would take most of the time."""
+    return values.ptr + wp.uint64(4) * wp.uint64(i)
+
+
+@wp.func
+def one_at(address: wp.uint64):
+    here = wp.array(ptr=address, shape=(1,), dtype=float)
+    return here[0]
+
+
+@wp.func
+def place_at(address: wp.uint64):
+    here = wp.array(ptr=address, shape=(1,), dtype=int)
+    return here[0]
+
+
+@wp.func
+def colour_at(address: wp.uint64):
+    """The vector of 4 values there."""
+    here = wp.array(ptr=address, shape=(1,), dtype=wp.vec4)
+    return here[0]
+
+
+@wp.func
+def add_at(address: wp.uint64, v: vec8):
+    """Add to the vector of 8 values there."""
+    here = wp.array(ptr=address, shape=(1,), dtype=vec8)
+    here[0] = here[0] + v
+
+
+@wp.func
+def get_half(values: wp.array[float], i: int):
+    """The vector of values i ... i + 7."""
+    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec8)
+    return here[0]
+
+
+@wp.func
+def put_half(values: wp.array[float], i: int, v: vec8):
+    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec8)
+    here[0] = v
+
+
+@wp.func
+def put_whole(values: wp.array[int], i: int, n: ivec16):
+    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=ivec16)
+    here[0] = n
 
 
 @wp.func
@@ -67,12 +118,12 @@ def fraction(q: vec16, n: ivec16):
 
 
 @wp.func
-def inside(share: vec16, place: ivec16, size: int):
-    """The shares of what arrives within a side of the picture, else 0."""
-    v = vec16()
+def within(v: vec16, number: int):
+    """The first so many values, else 0."""
+    first = vec16()
     for j in range(LANES):
-        v[j] = wp.where(wp.uint32(place[j]) < wp.uint32(size), share[j], 0.0)
-    return v
+        first[j] = wp.where(j < number, v[j], 0.0)
+    return first
 
 
 @wp.func
@@ -81,14 +132,6 @@ def least(n: ivec16):
     for j in range(1, LANES):
         first = wp.min(first, n[j])
     return first
-
-
-@wp.func
-def one_later(v: vec16):
-    later = vec16()
-    for j in range(LAST):
-        later[j + 1] = v[j]
-    return later
 
 
 @wp.func

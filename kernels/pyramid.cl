@@ -1,6 +1,6 @@
 /* Pull-push hole filling of planes: red, green, blue and weight, one after the other.
  *
- * The finest level holds means with a weight of 1, and nothing in holes; coarser ones hold sums. A
+ * Of the pixels, means have a weight of 1, and holes none; the levels hold sums over blocks of them. A
  * cell without weight is interpolated from the next coarser level.
  */
 
@@ -83,24 +83,38 @@ void complete(__global float *cells, const int height, const int width, const in
         const int pitch = pitch_of(w);
         const int step = h * pitch;
         for (int y = 0; y < h; ++y)
-            for (int x = 0; x < w; ++x) {
-                const int i = y * pitch + x;
-                if (at[i + 3 * step] == 0.0f)
-                    set_cell(at, i, step, between(at + 4 * step, h, w, y, x));
-            }
+            for (int first = 0; first < w; first += LANES)
+                if (least_value(get(at + 3 * step + y * pitch + first)) == 0.0f)
+                    for (int x = first; x < first + LANES && x < w; ++x) {
+                        const int i = y * pitch + x;
+                        if (at[i + 3 * step] == 0.0f)
+                            set_cell(at, i, step, between(at + 4 * step, h, w, y, x));
+                    }
     }
 }
 
-/* Pull-push of means with holes, as far as they are asked for. Returns 0 of nothing but holes.
+/* The least weight of a cell of the first level. */
+float least_weight(__global const float *weight, const int h, const int w)
+{
+    const int pitch = pitch_of(w);
+    float16 low = (float16)HUGE;
+    for (int y = 0; y < h; ++y)
+        for (int x = 0; x < pitch; x += LANES) {
+            const float16 n = get(weight + y * pitch + x);
+            low = (x + LANE < w & n < low) ? n : low;
+        }
+    return least_value(low);
+}
+
+/* Pull-push of a level of h x w cells. Returns 0 of nothing but holes.
  *
  * Levels are made until one has no empty cell.
  */
-int fill(__global float *total, const int step, const int height, const int width,
-         __global const float *scale, __global float *cells)
+int fill(__global float *cells, const int height, const int width)
 {
-    int h = (height + 1) / 2;
-    int w = (width + 1) / 2;
-    float low = pull(total, step, height, width, cells);
+    int h = height;
+    int w = width;
+    float low = least_weight(cells + 3 * h * pitch_of(w), h, w);
     __global float *at = cells;
     int levels = 1;
     while (low == 0.0f && (h > 1 || w > 1)) {
@@ -113,13 +127,6 @@ int fill(__global float *total, const int step, const int height, const int widt
     }
     if (low == 0.0f)
         return 0;
-    complete(cells, (height + 1) / 2, (width + 1) / 2, levels);
-    const int pitch = pitch_of(width);
-    for (int y = 0; y < height; ++y)
-        for (int x = 0; x < width; ++x) {
-            const int i = y * pitch + x;
-            if (total[3 * step + i] == 0.0f && scale[i] > 0.0f)
-                set_cell(total, i, step, between(cells, height, width, y, x));
-        }
+    complete(cells, height, width, levels);
     return 1;
 }

@@ -1,6 +1,6 @@
 """Pull-push hole filling of planes: red, green, blue and weight, one after the other.
 
-The finest level holds means with a weight of 1, and nothing in holes; coarser ones hold sums. A
+Of the pixels, means have a weight of 1, and holes none; the levels hold sums over blocks of them. A
 cell without weight is interpolated from the next coarser level.
 """
 
@@ -73,6 +73,15 @@ def set_cell(cells: wp.array[float], i: int, step: int, colour: wp.vec3):
 
 
 @wp.func
+def zeros(n: vec16):
+    """How many there are: a least value minds NaN, and takes longer."""
+    number = int(0)
+    for j in range(LANES):
+        number += wp.where(n[j] == 0.0, 1, 0)
+    return number
+
+
+@wp.func
 def complete(cells: wp.array[float], first: int, height: int, width: int, levels: int):
     """Push: fill the empty cells of `levels` levels, of which the last has none."""
     for up in range(1, levels):
@@ -86,30 +95,36 @@ def complete(cells: wp.array[float], first: int, height: int, width: int, levels
         pitch = pitch_of(w)
         step = h * pitch
         for y in range(h):
-            for x in range(w):
-                i = at + y * pitch + x
-                if cells[i + 3 * step] == 0.0:
-                    set_cell(cells, i, step, between(cells, at + 4 * step, h, w, y, x))
+            for first_x in range(0, w, LANES):
+                if zeros(get(cells, at + 3 * step + y * pitch + first_x)) > 0:
+                    for x in range(first_x, wp.min(first_x + LANES, w)):
+                        i = at + y * pitch + x
+                        if cells[i + 3 * step] == 0.0:
+                            set_cell(cells, i, step, between(cells, at + 4 * step, h, w, y, x))
 
 
 @wp.func
-def fill(
-    total: wp.array[float],
-    here: int,
-    step: int,
-    height: int,
-    width: int,
-    scale: wp.array[float],
-    cells: wp.array[float],
-    first: int,
-):
-    """Pull-push of means with holes, as far as they are asked for. Returns 0 of nothing but holes.
+def least_weight(cells: wp.array[float], first: int, h: int, w: int):
+    """The least weight of a cell of the first level."""
+    pitch = pitch_of(w)
+    low = vec16(HUGE)
+    for y in range(h):
+        for x in range(0, pitch, LANES):
+            n = get(cells, first + y * pitch + x)
+            for j in range(LANES):
+                low[j] = wp.where(x + j < w and n[j] < low[j], n[j], low[j])
+    return wp.min(low)
+
+
+@wp.func
+def fill(cells: wp.array[float], first: int, height: int, width: int):
+    """Pull-push of a level of height x width cells. Returns 0 of nothing but holes.
 
     Levels are made until one has no empty cell.
     """
-    h = int((height + 1) / 2)
-    w = int((width + 1) / 2)
-    low = pull(total, here, step, height, width, cells, first)
+    h = int(height)
+    w = int(width)
+    low = least_weight(cells, first + 3 * h * pitch_of(w), h, w)
     at = int(first)
     levels = int(1)
     while low == 0.0 and (h > 1 or w > 1):
@@ -121,11 +136,5 @@ def fill(
         levels += 1
     if low == 0.0:
         return 0
-    complete(cells, first, (height + 1) / 2, (width + 1) / 2, levels)
-    pitch = pitch_of(width)
-    for y in range(height):
-        for x in range(width):
-            i = y * pitch + x
-            if total[here + 3 * step + i] == 0.0 and scale[i] > 0.0:
-                set_cell(total, here + i, step, between(cells, first, height, width, y, x))
+    complete(cells, first, height, width, levels)
     return 1

@@ -43,7 +43,9 @@ LAYERS = {
     "mmmgpu.__main__": 3,
 }
 DOMAIN = 2  # every other module
-SHARED = {"mmmgpu.kernels.lanes", "mmmgpu.kernels.pyramid"}  # functions of several kernels
+SHARED = {
+    f"mmmgpu.kernels.{name}" for name in ("lanes", "orientation", "pyramid", "rings")
+}  # functions
 
 
 def tracked_files():

@@ -74,6 +74,18 @@ def test_mixed_prototypes(backend, own, size):
     assert_allclose(mixed(backend, *given), desired, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["mirrored", "down", "up and down"])
+def test_rows_arrive_in_any_order(backend, kind):
+    """Rows are shown when no later one reaches them, be that late."""
+    size = 40, 20
+    y = np.arange(40, dtype=np.float32)
+    down = {"mirrored": 38.7 - 2 * y, "down": 0 * y + 5.5, "up and down": 9.4 * (-1) ** y}[kind]
+    images, flows = prototypes("zero", size)
+    flow = np.stack([np.zeros(size), np.broadcast_to(down[:, None], size)], -1).astype(np.float32)
+    given = images, flows, flow, [1, 2], np.ones(size, np.float32)
+    assert_allclose(moved(backend, *given), moved("numpy", *given), rtol=0, atol=1e-4)
+
+
 def test_the_reference_mixes_what_it_moves():
     images, flows = prototypes("random", (9, 12))
     weights, scale = np.float32([[0.2, 0.5, 0.3]]), some_of((9, 12), np.random.default_rng(7))

@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
 
 from mmmgpu.backends.orientation import orient
-from mmmgpu.backends.planes import LANES, picture, pitch_of
+from mmmgpu.backends.planes import LANES, pitch_of
 from mmmgpu.errors import InputError
 from mmmgpu.operations import fill_holes, forward_warp
 
@@ -17,27 +17,21 @@ def applied(o, i, field):
     h, w, channels = field.shape
     pitch = pitch_of(w)
     area = h * pitch
-    nodes = np.zeros((LANES + o.nodes, channels))
-    pixels, cells = nodes[LANES : LANES + area], nodes[LANES:]
-    pixels.reshape(h, pitch, channels)[:, :w] = field
-    result = np.zeros((area, channels))
-    vectors = area // LANES
-    for v in range(vectors):
-        for k in range(o.firsts[i * vectors + v], o.firsts[i * vectors + v + 1]):
-            at = LANES + LANES * v + o.deltas[k]
-            result[LANES * v : LANES * (v + 1)] += (
-                o.shares[k].astype(float)[:, None] * nodes[at : at + LANES]
-            )
+    nodes = np.zeros((o.nodes, channels))
+    for y, x in np.ndindex(h, w):
+        vector, lane = divmod(y * pitch + x, LANES)
+        first = i * area // LANES + vector
+        for right, down, lanes in o.parts[o.firsts[first] : o.firsts[first + 1]]:
+            if lanes >> lane & 1:
+                off = o.flows[i, :, y + down, x + right] + (right, down)
+                assert np.abs(off).max() <= 1
+                nodes[y * pitch + x] += (1 - np.abs(off)).prod() * field[y + down, x + right]
+        nodes[y * pitch + x] *= o.shares[i, y, x]
     for row in range(o.rows[i], o.rows[i + 1]):
         span = slice(o.starts[row], o.starts[row + 1])
-        mean = o.row_shares[span].astype(float) @ cells[o.row_taps[span]]
-        target = o.targets[row]
-        if target < area:
-            assert not result[target].any()
-            result[target] = mean
-        else:
-            cells[target] = mean
-    return result.reshape(h, pitch, channels)[:, :w]
+        assert not nodes[o.targets[row]].any()
+        nodes[o.targets[row]] = o.row_shares[span].astype(float) @ nodes[o.row_taps[span]]
+    return nodes[:area].reshape(h, pitch, channels)[:, :w]
 
 
 def make_flows(name, size):
@@ -62,27 +56,21 @@ def test_it_is_the_filled_forward_warp(name, size):
         assert_allclose(applied(o, i, field[i]), desired[i], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["constant", "random", "tearing"])
-def test_what_is_fixed_is_the_flow_carried_along_itself(name):
-    flows = make_flows(name, (33, 20))
-    o = orient(flows, HOLE)
-    for i in range(2):
-        fixed = picture(o.fixed[i], 20)
-        assert_allclose(fixed, applied(o, i, flows[i]), rtol=0, atol=1e-5)
-
-
-def test_pixels_that_stay_need_no_rows():
+def test_pixels_that_stay_have_one_part_and_no_rows():
     o = orient(np.zeros((1, 5, 20, 2), np.float32), HOLE)
     assert len(o.targets) == 0
     assert_array_equal(o.firsts, np.arange(5 * 2 + 1))
-    assert_array_equal(o.deltas, 0)
-    assert_array_equal(o.shares, np.tile(np.float32(np.arange(32) < 20), 5).reshape(10, LANES))
-    assert_array_equal(o.fixed[..., :20], 0)
+    assert_array_equal(o.parts, np.tile([[0, 0, 0xFFFF], [0, 0, 0xF]], (5, 1)))
+    assert_array_equal(o.shares[..., :20], 1)
 
 
-def test_what_pads_a_row_is_carried_out_of_any_picture():
-    o = orient(np.zeros((1, 5, 20, 2), np.float32), HOLE)
-    assert o.fixed[..., 20:].min() > 1e8
+def test_parts_that_reach_over_the_sides_have_no_sources_there():
+    """A row's neighbour in memory is the next row's first pixel: it is none in the picture."""
+    flows = np.zeros((1, 3, 16, 2), np.float32)
+    flows[..., 0] = -0.5
+    o = orient(flows, HOLE)
+    last = o.parts[o.firsts[0] : o.firsts[1]]
+    assert_array_equal(last, [[0, 0, 0xFFFF], [1, 0, 0x7FFF]])
 
 
 def test_shares_of_every_pixel_add_up_to_one():

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends.orientation import orient
-from mmmgpu.backends.planes import LANES, pitch_of, planes
+from mmmgpu.backends.planes import LANES, pitch_of
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
 COLOURS = 3  # channels of a picture, as in kernels/sample
 RUN = 16  # points of a thread, as in kernels/sample
 WHITE = 65535  # of a texture, as in kernels/prototypes
+MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
 TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
 
 
@@ -177,42 +178,61 @@ class Launches(ABC):
     def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
         number, height, width, _ = images.shape
         held = orient(flows, hole)
-        textures = planes(np.rint(images * WHITE).astype(np.uint16))
-        parts = held.fixed, held.firsts, held.deltas, held.shares
+        textures = np.ones((number, height, pitch_of(width), COLOURS + 1), np.uint16)
+        textures[:, :, :width, :COLOURS] = np.rint(images * WHITE)
+        parts = np.pad(held.flows.ravel(), LANES), held.shares, held.firsts, held.parts
         rows = held.rows, held.targets, held.starts, held.row_taps, held.row_shares
         arrays = tuple(self.to_device(a) for a in (textures, *parts, *rows))
         return Prototypes(arrays, number, height, width, held.nodes, float(hole))
 
     def move_prototypes(self, held: Prototypes, flow: Any, used: Any, scale: Any) -> Any:
         members = self.to_host(used)
-        alone = [np.arange(len(members) + 1), members, np.ones(len(members))]
-        return self._mixtures(held, flow, 1, alone, scale)
+        alone = [np.arange(len(members) + 1), members, np.ones((len(members), 1))]
+        return self._mixtures(held, flow, 1, len(members), alone, scale)
 
     def mix_prototypes(self, held: Prototypes, flows: Any, weights: Any, scale: Any) -> Any:
         shares = self.to_host(weights)
-        parts = np.concatenate([[0], np.cumsum(np.count_nonzero(shares, axis=1))])
-        members = [parts, np.nonzero(shares)[1], shares[shares != 0]]
-        return self._mixtures(held, flows, len(shares), members, scale)
+        mixtures, number = shares.shape
+        together = 2 if mixtures >= 2 * self.workers else 1
+        groups = math.ceil(mixtures / together)
+        padded = np.zeros((groups, together, number), np.float32)
+        padded.reshape(-1, number)[:mixtures] = shares
+        used = padded.any(axis=1)
+        parts = np.concatenate([[0], np.cumsum(np.count_nonzero(used, axis=1))])
+        members = [parts, np.nonzero(used)[1], padded.transpose(0, 2, 1)[used]]
+        return self._mixtures(held, flows, mixtures, mixtures, members, scale)
 
     def _mixtures(
-        self, held: Prototypes, flows: Any, frames: int, members: list[Any], scale: Any
+        self,
+        held: Prototypes,
+        flows: Any,
+        frames: int,
+        mixtures: int,
+        members: list[Any],
+        scale: Any,
     ) -> Any:
         """Run kernels/prototypes with an accumulator for every worker."""
-        mixtures, pitch = len(members[0]) - 1, pitch_of(held.width)
+        pitch, together = pitch_of(held.width), members[2].shape[1]
         mixed = self.empty(mixtures, 3, held.height, pitch)
         if not mixtures:
             return mixed
-        workers = min(self.workers, mixtures)
+        workers = min(self.workers, len(members[0]) - 1)
         size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
+        ring = 1 << (held.height - 1).bit_length()
         arrived = self.empty(mixtures, dtype=np.int32)
         given = zip(members, (np.int32, np.int32, np.float32), strict=True)
         inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
-        inputs += [frames, mixtures, held.height, held.width, size, held.nodes, held.hole, workers]
+        inputs += [frames, mixtures, together, held.height, held.width, size, ring, held.nodes]
+        inputs += [held.hole, workers]
         outputs = [
-            self.empty(workers, 4, held.height * pitch + 2 * (pitch + 2 * LANES)),
-            self.empty(workers, 4, size),
-            self.empty(workers, 2, held.nodes),
-            self.empty(workers, 2, held.height, pitch),
+            self.empty(workers, ring, pitch + MARGIN, COLOURS + 1),
+            self.empty(workers, COLOURS + 1, size),
+            self.empty(workers, together, 2, held.height * pitch + LANES),
+            self.empty(workers, together, 2, held.nodes),
+            self.empty(workers, held.height + 1, dtype=np.int32),
+            self.empty(workers, 2, pitch, dtype=np.int32),
+            self.empty(workers, 7, pitch),
+            self.empty(workers, held.height, pitch, dtype=np.int32),
             mixed,
             arrived,
         ]

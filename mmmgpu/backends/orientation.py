@@ -1,15 +1,16 @@
 """Re-orientation along fixed flows (CE05, Eq. 2), prepared once for all frames.
 
 The residual flow C_syn - C_i is carried to the pixels of prototype i by a forward warp along C_i,
-and holes are filled. C_i never changes, so this is one sparse linear map for each prototype:
+and holes are filled. C_i never changes, so neither does which pixels give to which: a mean over
 
-    W_F(C_syn - C_i, C_i) = L_i C_syn - L_i C_i
+    (1 - |x(s) + u(s) - x(t)|) (1 - |y(s) + v(s) - y(t)|),      C_i(s) = (u, v),
 
-The pixels of a vector, 16 neighbours of a row, mostly come from neighbours in C_syn. So the map is
-kept in parts: for a vector and a distance, the shares that its pixels have in those so much further
-on. Holes have rows of their own; so have the cells of the pull-push pyramid that they are
-interpolated from, which the rows of holes refer to like pixels. Not here: warping along the result,
-whose pattern is new in every frame.
+for each pixel t, over the sources s that arrive around it. The pixels of a vector, 16 neighbours of
+a row, mostly come from neighbours. So their sources are kept in parts: for a vector and a distance,
+for which of its pixels the one so much further on is a source. Shares follow from C_i, which takes
+less room than they would. Holes have rows of shares; so have the cells of the pull-push pyramid
+that they are interpolated from. Not here: warping along the result, whose pattern is new in every
+frame.
 """
 
 from collections.abc import Sequence
@@ -30,31 +31,29 @@ from mmmgpu.backends.reference import landings
 I32 = NDArray[np.int32]
 Numbers = NDArray[np.int64]
 
-NOWHERE = 2e8  # [px] fixed flow of what pads a row: it carries beyond any picture
-
 
 @dataclass(frozen=True)
 class Orientations:
-    """L_i of M prototypes of h x w pixels. Rows are padded to `pitch` pixels, whole vectors.
+    """Of M prototypes of h x w pixels. Rows are padded to `pitch` pixels, whole vectors.
 
-    A node is a pixel, or from h pitch + 16 on a cell.
+    A node is a pixel, or from h pitch on a cell.
 
-    fixed: L_i C_i, (M, 2, h, pitch) [px].
+    flows: C_i, (M, 2, h, pitch) [px].
+    shares: one over the weight of each pixel, 0 in holes, (M, h, pitch).
     firsts: first part of each vector, (M h pitch / 16 + 1,).
-    deltas: how many pixels further on a part lies, (parts,).
-    shares: of the vector's pixels in it, (parts, 16).
+    parts: how far right and down a part lies, and which of 16 pixels have a source there, as bits;
+        (parts, 3).
     rows: first row of each prototype, (M + 1,).
     targets: the node that each row gives, (R,).
     starts: first tap of each row, (R + 1,).
     row_taps, row_shares: nodes and their shares, (starts[R],).
-    nodes: places of a flow with 16 before it, 16 after it, and the cells of the prototype that has
-        most.
+    nodes: pixels of a prototype, and cells of the prototype that has most.
     """
 
-    fixed: F32
-    firsts: I32
-    deltas: I32
+    flows: F32
     shares: F32
+    firsts: I32
+    parts: I32
     rows: I32
     targets: I32
     starts: I32
@@ -64,7 +63,7 @@ class Orientations:
 
 
 def orient(flows: F32, hole: float) -> Orientations:
-    """L_i of the flows C_i, (M, h, w, 2) [px]; pixels that get less weight than `hole` are filled.
+    """What re-orientation along C_i, (M, h, w, 2) [px], needs; less weight than `hole` is a hole.
 
     Raises:
         InputError: A flow leaves no pixel in the picture.
@@ -72,91 +71,69 @@ def orient(flows: F32, hole: float) -> Orientations:
     _, h, w, _ = flows.shape
     with ThreadPoolExecutor(default_threads()) as pool:
         done = list(pool.map(_orient_one, flows, repeat(hole)))
-    fixed = planes(np.stack([o.fixed for o in done]))
-    fixed[..., w:] = NOWHERE
     rows = [rows for o in done for rows in o.rows]
     return Orientations(
-        fixed=fixed,
-        firsts=_starts(np.concatenate([o.parts.counts for o in done])),
-        deltas=np.concatenate([o.parts.deltas for o in done]),
-        shares=np.concatenate([o.parts.shares for o in done]),
+        flows=planes(flows),
+        shares=planes(np.stack([o.shares for o in done])[..., None])[:, 0],
+        firsts=_starts(np.concatenate([o.counts for o in done])),
+        parts=np.concatenate([o.parts for o in done]),
         rows=_starts([len(o.targets) for o in done]),
         targets=np.concatenate([o.targets for o in done]).astype(np.int32),
         starts=_starts(np.concatenate([np.diff(r.indptr) for r in rows])),
         row_taps=np.concatenate([r.indices for r in rows]).astype(np.int32),
         row_shares=np.concatenate([r.data for r in rows]).astype(np.float32),
-        nodes=h * pitch_of(w) + 2 * LANES + max(o.rows[0].shape[0] for o in done),
+        nodes=h * pitch_of(w) + max(o.rows[0].shape[0] for o in done),
     )
 
 
 @dataclass(frozen=True)
-class _Parts:
-    """Of one prototype: parts of each vector (h pitch / 16,); deltas (n,); shares (n, 16)."""
-
-    counts: Numbers
-    deltas: I32
-    shares: F32
-
-
-@dataclass(frozen=True)
 class _Oriented:
-    """L_i: fixed (h, w, 2); parts; sparse rows of cells and of holes; which nodes these are."""
+    """Of one prototype: shares (h, w); number of parts of each vector; parts (n, 3); sparse rows.
 
-    fixed: F32
-    parts: _Parts
+    rows, targets: of cells and of holes, and which nodes these are.
+    """
+
+    shares: F32
+    counts: Numbers
+    parts: I32
     rows: tuple[Any, Any]
     targets: Numbers
 
 
 def _orient_one(flow: F32, hole: float) -> _Oriented:
     h, w, _ = flow.shape
-    first_cell = h * pitch_of(w) + LANES
-    pixels, valid = _splatted(flow, hole)
-    members, through = _filling(valid)
-    cells, holes = members @ pixels, np.flatnonzero(~valid)
-    own = flow.reshape(-1, 2).astype(np.float64)
-    fixed = pixels @ own
-    fixed[holes] = through @ (cells @ own)
+    first_cell = h * pitch_of(w)
+    target, source, share = landings(flow)
+    weight = np.bincount(target, share, minlength=h * w).reshape(h, w)
+    valid = weight.astype(np.float32) >= np.float32(hole)
+    check_some_valid(valid.sum(keepdims=True))
+    used = valid.ravel()[target] & (share > 0)
+    cells, through = _filling(valid)
     cells.indices = _padded(cells.indices, w)
     through.indices += first_cell
-    targets = np.concatenate([first_cell + np.arange(cells.shape[0]), _padded(holes, w)])
-    carried = fixed.reshape(h, w, 2).astype(np.float32)
-    return _Oriented(carried, _parts(pixels, w), (cells, through), targets)
+    holes = _padded(np.flatnonzero(~valid), w)
+    targets = np.concatenate([first_cell + np.arange(cells.shape[0]), holes])
+    shares = np.divide(1, weight, where=valid, out=np.zeros_like(weight)).astype(np.float32)
+    counts, parts = _parts(target[used], source[used], h, w)
+    return _Oriented(shares, counts, parts, (cells, through), targets)
 
 
 def _starts(lengths: Sequence[int] | NDArray[Any]) -> I32:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
-def _splatted(flow: F32, hole: float) -> tuple[Any, NDArray[np.bool_]]:
-    """The forward warp along `flow` as shares of sources in targets, and which are no holes (h, w).
-
-    The rows of holes are empty.
-    """
-    h, w, _ = flow.shape
-    target, source, share = landings(flow)
-    splat = sparse.csr_matrix((share.astype(np.float64), (target, source)), shape=(h * w, h * w))
-    splat.eliminate_zeros()
-    weight = np.asarray(splat.sum(axis=1)).ravel()
-    valid = weight.astype(np.float32) >= np.float32(hole)
-    check_some_valid(valid.sum(keepdims=True))
-    scale = np.divide(1, weight, where=valid, out=np.zeros_like(weight))
-    pixels = sparse.diags(scale) @ splat
-    pixels.eliminate_zeros()
-    return pixels, valid.reshape(h, w)
-
-
-def _parts(pixels: Any, width: int) -> _Parts:
-    """Shares of pixels in pixels, sparse (h w, h w), by vector and distance."""
-    area = pixels.shape[0] // width * pitch_of(width)
-    target = _padded(np.repeat(np.arange(pixels.shape[0]), np.diff(pixels.indptr)), width)
-    delta = _padded(pixels.indices, width) - target
-    vector, lane = np.divmod(target, LANES)
-    part, which = np.unique(vector * (2 * area) + delta + area, return_inverse=True)
-    shares = np.zeros((len(part), LANES), np.float32)
-    shares[which, lane] = pixels.data
-    counts = np.bincount(part // (2 * area), minlength=area // LANES)
-    return _Parts(counts, (part % (2 * area) - area).astype(np.int32), shares)
+def _parts(target: Numbers, source: Numbers, h: int, w: int) -> tuple[Numbers, I32]:
+    """Which pixels are sources of which, by vector and distance: numbers of parts, and these."""
+    (y, x), (down, right) = np.divmod(target, w), np.divmod(source, w)
+    vector, lane = np.divmod(_padded(target, w), LANES)
+    reach = 2 * w - 1
+    distance = (down - y + h - 1) * reach + right - x + w - 1
+    part, which = np.unique(vector * (2 * h - 1) * reach + distance, return_inverse=True)
+    vector, distance = np.divmod(part, (2 * h - 1) * reach)
+    down, right = np.divmod(distance, reach)
+    lanes = np.bincount(which, 1 << lane, minlength=len(part))
+    parts = np.stack([right - w + 1, down - h + 1, lanes], axis=1).astype(np.int32)
+    return np.bincount(vector, minlength=h * pitch_of(w) // LANES), parts
 
 
 def _padded(pixels: NDArray[Any], width: int) -> Numbers:

@@ -1,0 +1,63 @@
+/* The residual flow of a prototype, carried to its pixels: W_F(C_syn - C_i, C_i) of CE05, Eq. 2.
+ *
+ * It is a mean over neighbours that are always the same (see mmmgpu/backends/orientation.py), made for
+ * vectors of 16 pixels of a row. Shares follow from C_i: kept ones would take more time to read.
+ */
+
+/* How much of what arrives `off` pixels away a pixel gets. */
+float16 near(const float16 off)
+{
+    return 1.0f - as_float16(as_int16(off) & 0x7fffffff);
+}
+
+/* The flow that is missing to prototype m, for each of its pixels, in one frame or two. */
+void orient(const int m, __global const float *own, __global const float *shares,
+            __global const int *firsts, __global const int *neighbours, __global const int *rows,
+            __global const int *targets, __global const int *starts, __global const int *row_taps,
+            __global const float *row_shares, const int area, const int pitch, const int nodes,
+            const int together, __global const float *field, __global float *residual)
+{
+    const int vectors = area / LANES;
+    __global const float *next = field + 2 * (area + LANES);
+    own += 2 * m * area;
+    shares += m * area;
+    firsts += m * vectors;
+    for (int v = 0; v < vectors; ++v) {
+        const int i = LANES * v;
+        float16 x = (float16)0.0f;
+        float16 y = (float16)0.0f;
+        float16 next_x = (float16)0.0f;
+        float16 next_y = (float16)0.0f;
+        for (int k = firsts[v]; k < firsts[v + 1]; ++k) {
+            const int right = neighbours[3 * k];
+            const int down = neighbours[3 * k + 1];
+            const int s = i + down * pitch + right;
+            const float16 qx = get(own + s);
+            const float16 qy = get(own + area + s);
+            const int16 given = ((int16)neighbours[3 * k + 2] & (int16)1 << LANE) != 0;
+            const float16 share = given ? near(qx + right) * near(qy + down) : (float16)0.0f;
+            x += share * (get(field + s) - qx);
+            y += share * (get(field + area + s) - qy);
+            if (together > 1) {
+                next_x += share * (get(next + s) - qx);
+                next_y += share * (get(next + area + s) - qy);
+            }
+        }
+        const float16 share = get(shares + i);
+        put(residual + i, share * x);
+        put(residual + nodes + i, share * y);
+        if (together > 1) {
+            put(residual + 2 * nodes + i, share * next_x);
+            put(residual + 3 * nodes + i, share * next_y);
+        }
+    }
+    for (int plane = 0; plane < 2 * together; ++plane) {
+        __global float *at = residual + plane * nodes;
+        for (int row = rows[m]; row < rows[m + 1]; ++row) {
+            float sum = 0.0f;
+            for (int j = starts[row]; j < starts[row + 1]; ++j)
+                sum += row_shares[j] * at[row_taps[j]];
+            at[targets[row]] = sum;
+        }
+    }
+}
