@@ -46,8 +46,8 @@ def matching_work(backends, prototypes=46, frames=450, side=128):
     flows = smooth_flow(rng, frames, side, side)
 
     def scan(name, some):
-        views = [View(0, map_, basis.flows[1:][:some], flows)]
-        return FlowScan(basis, views, np.zeros(some, np.int64), backend=name)()
+        views = [View(map_, basis.flows[1:][:some], flows)]
+        return FlowScan(basis, views, backend=name)()
 
     pixels = int((basis.w_f > 0.02).sum())
     return Work(
