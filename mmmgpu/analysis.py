@@ -27,7 +27,7 @@ from mmmgpu.backends import Backend
 from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import LIP, MOUTH, Basis, around, cut
 from mmmgpu.errors import InputError
-from mmmgpu.flows import Matcher, concatenate, matcher, pull
+from mmmgpu.flows import Matcher, at_scale, concatenate, matcher, pull
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
@@ -38,7 +38,7 @@ STEP_RIDGE = 3e-4  # the same for a Gauss-Newton step
 TEXTURE_RIDGE = 1e-6  # the same for beta: makes the programme strictly convex
 STEPS = 2  # Gauss-Newton steps
 OUTLIER = 0.2  # a pixel that differs by more than this counts less in a step
-LEAST = 16  # [px] width and height of a picture that flow is looked for in
+SCALE = 0.5  # of the pictures that flow is looked for in: they do for a beginning
 TINY = 1e-12  # least weight of a product of slopes
 NEAREST = 16  # prototypes that the first estimate of beta is made of
 STILL = 1e-6  # [px^2] mean square of a flow that is none
@@ -99,7 +99,7 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
     return Analyzer(
         basis=basis,
         inside=inside,
-        match=matcher(flow),
+        match=at_scale(matcher(flow), SCALE),
         kernels=kernels,
         held=kernels.hold_prototypes(basis.images, basis.flows, HOLE),
         pixels=pixels,
@@ -151,21 +151,9 @@ def analyze(analyzer: Analyzer, image: F32) -> tuple[Floats, Floats]:
 
 
 def _flow_to(analyzer: Analyzer, image: F32, nearest: int) -> F32:
-    """Flow from the reference to `image` by way of the prototype that resembles it most.
-
-    Pictures of half the size do for a beginning.
-    """
-    basis, (h, w) = analyzer.basis, image.shape[:2]
-    size = (max(LEAST, (w + 1) // 2), max(LEAST, (h + 1) // 2))
-    a, b = (_resized(i, size) for i in (basis.images[nearest], image))
-    unit = np.array([w / size[0], h / size[1]], np.float32)
-    flow = _resized(analyzer.match(a, b), (w, h)) * unit
-    return concatenate(basis.flows[nearest], flow)
-
-
-def _resized(field: F32, size: tuple[int, int]) -> F32:
-    """A field (h, w, C) at another size (width, height)."""
-    return np.asarray(cv2.resize(field, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    """Flow from the reference to `image` by way of the prototype that resembles it most."""
+    basis = analyzer.basis
+    return concatenate(basis.flows[nearest], analyzer.match(basis.images[nearest], image))
 
 
 def fit_flow(analyzer: Analyzer, flow: F32) -> Floats:

@@ -5,6 +5,7 @@ flow fails where two pictures differ much; a path through pictures that resemble
 not.
 """
 
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -18,6 +19,7 @@ F32 = NDArray[np.float32]
 Matcher = Callable[[F32, F32], F32]
 
 NEIGHBOURS = 8  # edges of a frame in the graph
+LEAST = 16  # [px] width and height of a picture that flow is looked for in
 
 
 def matcher(name: str = "dis") -> Matcher:
@@ -34,6 +36,19 @@ def matcher(name: str = "dis") -> Matcher:
         return found
 
     return flow
+
+
+def at_scale(match: Matcher, scale: float) -> Matcher:
+    """`match` in pictures `scale` times as wide, at most 1; flows are those of the whole ones."""
+
+    def flow(a: F32, b: F32) -> F32:
+        h, w = a.shape[:2]
+        size = (max(LEAST, math.ceil(scale * w)), max(LEAST, math.ceil(scale * h)))
+        small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (a, b))
+        found = cv2.resize(match(*small), (w, h), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(found * np.array([w / size[0], h / size[1]], np.float32), np.float32)
+
+    return match if scale == 1 else flow
 
 
 def _dis() -> Any:

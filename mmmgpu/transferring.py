@@ -35,7 +35,7 @@ from mmmgpu.corpus_steps import (
 from mmmgpu.correspondence import Correspondence, rbf_correspondence
 from mmmgpu.errors import InputError
 from mmmgpu.flow_matching import SMOOTHING, View
-from mmmgpu.flows import Matcher, best_flow, best_of, concatenate, matcher
+from mmmgpu.flows import Matcher, at_scale, best_flow, best_of, concatenate, matcher
 from mmmgpu.matching import BALANCE, Matching, match_prototypes
 from mmmgpu.models import Model
 from mmmgpu.parallel import Cancelled, map_ordered
@@ -49,6 +49,7 @@ from mmmgpu.tracks import Reference, crop, frame_at, make_reference
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
+WIDE = 64  # [px] at most, of a mouth in the pictures in which B's flows are looked for
 IMAGES = "images"  # beside the kinds of reference frames, what a step of flows keeps
 
 
@@ -371,10 +372,18 @@ def _flow_finder(
     return flows_to
 
 
+def frame_matcher(name: str, region: Region) -> Matcher:
+    """One of `flows.MATCHERS` for all frames of a corpus, in pictures as large as need be.
+
+    Matching finds as many counterparts with mouths 47, 64 and 94 px wide.
+    """
+    return at_scale(matcher(name), min(1.0, WIDE / region.mouth[2]))
+
+
 def _flowing(shared: tuple[Path, Region, Mapping[str, F32], F32, str]) -> Work:
     """Keeps the pictures of a stretch and their flows from each reference."""
     folder, region, origins, mask, flow = shared
-    flows_to = _flow_finder(origins, mask, matcher(flow))
+    flows_to = _flow_finder(origins, mask, frame_matcher(flow, region))
 
     def work(stretch: Stretch, tick: Tick) -> None:
         seen: dict[str, list[F32]] = {name: [] for name in (IMAGES, *origins)}

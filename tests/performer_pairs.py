@@ -21,7 +21,7 @@ from mmmgpu.performer_mouth import lower_teeth_edge, upper_teeth_edge
 from mmmgpu.prototypes import choose_prototypes
 from mmmgpu.reference_pairs import most_open
 from mmmgpu.regions import lip_mask, mouth_mask, region_around
-from mmmgpu.transferring import carried_mask
+from mmmgpu.transferring import carried_mask, frame_matcher
 
 PROTOTYPES, FRAMES = 46, 450
 APART = 1.0  # [px] of two points in one frame, or the second is left out
@@ -216,9 +216,9 @@ def _region(face, shows, t):
 def _basis_of_a(face, shows, rng):
     region = _region(face, shows, 0)
     images = mouth_pictures(face, shows, region, rng)
-    direct = _flows(images, [0], mouth_mask(region))[0]
+    direct = _flows(images, [0], mouth_mask(region), matcher())[0]
     opened = most_open(make_basis(images, direct, 0, region))
-    closed, from_open = _flows(images, [0, opened], mouth_mask(region))
+    closed, from_open = _flows(images, [0, opened], mouth_mask(region), matcher())
     basis = make_basis(images, closed, 0, region)
     return basis, opened, {"closed": basis.flows, "open": still_outside(from_open, basis.cover)}
 
@@ -226,15 +226,15 @@ def _basis_of_a(face, shows, rng):
 def _basis_of_b(face, shows, origins, rng):
     region = _region(face, shows, origins[0])
     images = mouth_pictures(face, shows, region, rng)
-    flows = _flows(images, origins, mouth_mask(region))
+    flows = _flows(images, origins, mouth_mask(region), frame_matcher("dis", region))
     masks = lip_mask(region), mouth_mask(region), mouth_mask(region)
     kinds = dict(zip(("closed", "open"), flows, strict=True))
     return Basis(images, flows[0], int(origins[0]), region, *masks), kinds
 
 
-def _flows(images, origins, mask):
+def _flows(images, origins, mask, match):
     """Flows of all images from each of the frames `origins`, direct or by another origin."""
-    match, found = matcher(), []
+    found = []
     for o in origins:
         via = [(images[i], match(images[o], images[i])) for i in origins if i != o]
 

@@ -8,6 +8,7 @@ from worlds import texture
 from mmmgpu.flows import (
     MATCHERS,
     NEIGHBOURS,
+    at_scale,
     best_flow,
     concatenate,
     explanation_error,
@@ -40,6 +41,31 @@ def test_a_known_motion_is_found(name):
     inside = flow[10:-10, 10:-10].reshape(-1, 2)
     np.testing.assert_allclose(np.median(inside, axis=0), (-3, 2), atol=0.15)
     assert np.abs(inside - (-3, 2)).mean() < 0.3
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.68, 1.0])
+def test_flow_is_found_in_smaller_pictures(scale):
+    large = texture(81, 90)
+    a, b = large[10:71, 10:80], large[8:69, 13:83]
+    flow = at_scale(matcher(), scale)(a, b)
+    assert flow.shape == (61, 70, 2)
+    assert flow.dtype == np.float32
+    inside = flow[10:-10, 10:-10].reshape(-1, 2)
+    np.testing.assert_allclose(np.median(inside, axis=0), (-3, 2), atol=0.2)
+
+
+def test_pictures_are_not_made_smaller_than_flow_needs():
+    seen = []
+
+    def match(a, b):
+        seen.append((a.shape, b.shape))
+        return np.ones((*a.shape[:2], 2), np.float32)
+
+    flow = at_scale(match, 0.25)(
+        np.zeros((40, 84, 3), np.float32), np.zeros((40, 84, 3), np.float32)
+    )
+    assert seen == [((16, 21, 3), (16, 21, 3))]
+    np.testing.assert_allclose(flow, np.broadcast_to([4, 2.5], (40, 84, 2)))
 
 
 @pytest.mark.parametrize("name", MATCHERS)
