@@ -44,11 +44,15 @@ def at_scale(match: Matcher, scale: float) -> Matcher:
     def flow(a: F32, b: F32) -> F32:
         h, w = a.shape[:2]
         size = (max(LEAST, math.ceil(scale * w)), max(LEAST, math.ceil(scale * h)))
-        small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (a, b))
-        found = cv2.resize(match(*small), (w, h), interpolation=cv2.INTER_LINEAR)
+        small_a, small_b = (_shrunk(image, size) for image in (a, b))
+        found = cv2.resize(match(small_a, small_b), (w, h), interpolation=cv2.INTER_LINEAR)
         return np.asarray(found * np.array([w / size[0], h / size[1]], np.float32), np.float32)
 
     return match if scale == 1 else flow
+
+
+def _shrunk(image: F32, size: tuple[int, int]) -> F32:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _dis() -> Any:
