@@ -2,12 +2,21 @@
 
 import os
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 from test_backends import ONE_OPERATION, run
 
-from mmmgpu.backends.pocl_cache import archive_path, hold, keep, remove_stale, unpack
+from mmmgpu.backends.pocl_cache import (
+    OWN,
+    archive_path,
+    cache_variables,
+    hold,
+    keep,
+    remove_stale,
+    unpack,
+)
 
 
 @pytest.fixture
@@ -75,6 +84,19 @@ def test_folders_that_are_held_or_new_or_others_are_not_removed(tmp_path):
     os.close(held)
     remove_stale(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == kept - {"mmmgpu-opencl-held"}
+
+
+def test_a_process_holds_its_folder_with_an_archive_and_without(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("atexit.register", lambda *_: None)
+    for name in OWN:
+        monkeypatch.delenv(name, raising=False)
+    for _ in range(2):
+        folder = Path(cache_variables()["POCL_CACHE_DIR"])
+        with pytest.raises(OSError, match="unavailable"):
+            hold(folder)
+        keep(filled(folder, "x/a.so"), archive_path(), set())
 
 
 def filled(folder, *names):

@@ -37,10 +37,10 @@ def cache_variables() -> dict[str, str]:
         return UNUSED
     remove_stale(Path(tempfile.gettempdir()))
     folder = Path(tempfile.mkdtemp(prefix=PREFIX))
+    archive = archive_path()
+    known = unpack(archive, folder)  # which may make the folder anew
     with suppress(OSError):
         hold(folder)  # until the process ends
-    archive = archive_path()
-    known = unpack(archive, folder)
     atexit.register(keep, folder, archive, known)
     return {"POCL_CACHE_DIR": str(folder), "POCL_KERNEL_CACHE": "1"}
 
