@@ -127,14 +127,6 @@ def within(v: vec16, number: int):
 
 
 @wp.func
-def least(n: ivec16):
-    first = n[0]
-    for j in range(1, LANES):
-        first = wp.min(first, n[j])
-    return first
-
-
-@wp.func
 def share_of(n: vec16, least: float):
     """One over the weight where it is enough, else 0."""
     share = vec16()

@@ -80,12 +80,12 @@ def mix_prototypes(
     place = 2 * worker * pitch
     step = 7 * worker * pitch
     list = worker * area
-    for i in range(ring * row):
-        total[here + i] = 0.0
-    for i in range(4 * size):
-        cells[cell + i] = 0.0
-    for i in range(2 * together * (area + LANES)):
-        field[there - LANES + i] = 0.0
+    for i in range(0, ring * row, LANES):
+        put(total, here + i, vec16())
+    for i in range(0, 4 * size, LANES):
+        put(cells, cell + i, vec16())
+    for i in range(0, 2 * together * (area + LANES), LANES):
+        put(field, there - LANES + i, vec16())
     for group in range(worker, (mixtures + together - 1) / together, workers):
         job = together * group
         number = wp.min(together, mixtures - job)

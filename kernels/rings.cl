@@ -23,15 +23,19 @@ int reach(__global const float *down, const int h, const int pitch, __global int
     int most = 1;
     opens[h] = h;
     for (int y = h - 1; y >= 0; --y) {
-        int16 from = (int16)h;
-        int16 to = (int16)-1;
+        const float16 above = (float16)(-1 - y);
+        const float16 below = (float16)(h - y);
+        float16 low = below;
+        float16 high = above;
         for (int x = 0; x < pitch; x += LANES) {
-            const int16 row = y + whole(within_reach(get(down + y * pitch + x)));
-            from = (row >= -1 & row < from) ? row : from;
-            to = (row < h & row > to) ? row : to;
+            const float16 q = get(down + y * pitch + x);
+            low = (q >= above & q < low) ? q : low;
+            high = (q < below & q > high) ? q : high;
         }
-        const int first = least(from) < 0 ? 0 : least(from);
-        const int last = -least(-to) < h - 1 ? 1 - least(-to) : h - 1;
+        const int from = y + least(whole(low));
+        const int to = y - least(-whole(high));
+        const int first = from < 0 ? 0 : from;
+        const int last = to < h - 1 ? to + 1 : h - 1;
         open = first < open ? first : open;
         most = last - open < most ? most : last - open + 1;
         opens[y] = open;
@@ -62,7 +66,7 @@ void aim(__global const ushort16 *texture, const int y, const int h, const int w
         const int16 above = ny + y;
         const int16 below = above + 1;
         const int16 column = COLOUR * (x + LEFT);
-        const int16 across = x >= -1 & x < w & i + LANE < w;
+        const int16 across = x >= -1 & x < w; /* what pads a row is not moved */
         const int16 starts = above >= 0 & above < h;
         const int16 ends = below >= 0 & below < h;
         const int16 upper = (above & (ring - 1)) * row + column;

@@ -18,7 +18,6 @@ from mmmgpu.kernels.lanes import (
     get,
     get_half,
     ivec16,
-    least,
     one_at,
     pitch_of,
     place_at,
@@ -43,6 +42,26 @@ MARGIN = wp.constant(40)  # pixels of a row of sums beside the picture
 
 
 @wp.func
+def lower(low: vec16, q: vec16, least: float):
+    """The lower of each, of those q that are not below the least."""
+    v = vec16()
+    for j in range(LANES):
+        counts = wp.where(q[j] < least, low[j], q[j])
+        v[j] = wp.where(counts < low[j], counts, low[j])
+    return v
+
+
+@wp.func
+def higher(high: vec16, q: vec16, end: float):
+    """The higher of each, of those q that are below the end."""
+    v = vec16()
+    for j in range(LANES):
+        counts = wp.where(q[j] < end, q[j], high[j])
+        v[j] = wp.where(counts > high[j], counts, high[j])
+    return v
+
+
+@wp.func
 def reach(residual: wp.array[float], down: int, h: int, pitch: int, opens: wp.array[int], at: int):
     """Rows of sums that are needed at once.
 
@@ -52,15 +71,17 @@ def reach(residual: wp.array[float], down: int, h: int, pitch: int, opens: wp.ar
     most = int(1)
     opens[at + h] = h
     for y in range(h - 1, -1, -1):
-        top = ivec16(h)
-        bottom = ivec16(1)
+        above = -1.0 - float(y)
+        below = float(h - y)
+        low = vec16(below)
+        high = vec16(above)
         for x in range(0, pitch, LANES):
-            row = whole(get(residual, down + y * pitch + x)) + ivec16(y)
-            for j in range(LANES):
-                top[j] = wp.where(row[j] >= -1, wp.min(row[j], top[j]), top[j])
-                bottom[j] = wp.where(row[j] < h, wp.min(-row[j], bottom[j]), bottom[j])
-        open = wp.min(wp.max(least(top), 0), open)
-        last = wp.min(1 - least(bottom), h - 1)
+            q = get(residual, down + y * pitch + x)
+            low = lower(low, q, above)
+            high = higher(high, q, below)
+        first = y + int(wp.floor(wp.min(low)))
+        last = wp.min(y + int(wp.floor(wp.max(high))) + 1, h - 1)
+        open = wp.min(wp.max(first, 0), open)
         most = wp.max(last - open + 1, most)
         opens[at + y] = open
     ring = int(1)
@@ -71,14 +92,17 @@ def reach(residual: wp.array[float], down: int, h: int, pitch: int, opens: wp.ar
 
 @wp.func
 def places_of(column: ivec16, row: ivec16, first: int, h: int, w: int, pitch: int, ring: int):
-    """Where the sums of pixels are, and of those right of them; 0 for those that arrive nowhere."""
+    """Where the sums of pixels are, and of those right of them; 0 for those that arrive nowhere.
+
+    What pads a row is not moved, so that it stays outside the picture.
+    """
     place = ivec16()
     length = COLOUR * (pitch + MARGIN)
     for j in range(LANES):
         x = column[j] + first + j
-        across = wp.uint32(x + 1) <= wp.uint32(w) and first + j < w
         there = (row[j] & (ring - 1)) * length + COLOUR * (x + LEFT)
-        place[j] = wp.where(across and wp.uint32(row[j]) < wp.uint32(h), there, 0)
+        inside = wp.where(wp.uint32(row[j]) < wp.uint32(h), there, 0)
+        place[j] = wp.where(wp.uint32(x + 1) <= wp.uint32(w), inside, 0)
     return place
 
 
@@ -176,19 +200,35 @@ def known(share: vec16):
 
 
 @wp.func
+def missed(asked: vec16, share: vec16):
+    """What is asked for where there is no mean, else 0."""
+    v = vec16()
+    for j in range(LANES):
+        v[j] = wp.where(share[j] > 0.0, 0.0, asked[j])
+    return v
+
+
+@wp.func
+def positive(v: vec16):
+    """How many there are."""
+    number = int(0)
+    for j in range(LANES):
+        number += wp.where(v[j] > 0.0, 1, 0)
+    return number
+
+
+@wp.func
 def add(out: wp.array[float], i: int, v: vec16):
     put(out, i, get(out, i) + v)
 
 
 @wp.func
-def add_pairs(cells: wp.array[float], i: int, v: vec16, more: int):
-    """Add half of the sums over blocks of 2 x 2, or begin them."""
+def add_pairs(cells: wp.array[float], i: int, v: vec16, more: float):
+    """Add half of the sums over blocks of 2 x 2 (`more` is 1), or begin them (0)."""
     sum = vec8()
     for j in range(HALF):
         sum[j] = v[2 * j] + v[2 * j + 1]
-    if more == 1:
-        sum += get_half(cells, i)
-    put_half(cells, i, sum)
+    put_half(cells, i, sum + more * get_half(cells, i))
 
 
 @wp.func
@@ -233,23 +273,22 @@ def show(
         blue = wp.cw_mul(share, channel(a, b, c, d, 2))
         i = y * pitch + x
         asked = get(scale, i)
-        lacks = int(0)
-        for j in range(LANES):
-            lacks += wp.where(share[j] == 0.0 and asked[j] > 0.0, 1, 0)
-        if lacks > 0:
+        lacks = missed(asked, share)
+        if positive(lacks) > 0:
             for j in range(LANES):
-                if share[j] == 0.0 and asked[j] > 0.0:
+                if lacks[j] > 0.0:
                     holes[list + number] = i + j
                     number += 1
         part = weight * asked
         add(out, start + i, wp.cw_mul(part, red))
         add(out, start + area + i, wp.cw_mul(part, green))
         add(out, start + 2 * area + i, wp.cw_mul(part, blue))
+        more = float(y % 2)
         at = cell + y / 2 * across + x / 2
-        add_pairs(cells, at, red, y % 2)
-        add_pairs(cells, at + step, green, y % 2)
-        add_pairs(cells, at + 2 * step, blue, y % 2)
-        add_pairs(cells, at + 3 * step, known(share), y % 2)
+        add_pairs(cells, at, red, more)
+        add_pairs(cells, at + step, green, more)
+        add_pairs(cells, at + 2 * step, blue, more)
+        add_pairs(cells, at + 3 * step, known(share), more)
     return number
 
 
