@@ -7,8 +7,9 @@ ones z, in units of what is seen:
 
     (z - y)' W (z - y),
 
-where Eq. 4 has I. The best one, summed over the folds, is then fitted on all clips. So GDLR stops
-early, and every method has its constants from the same evidence.
+where Eq. 4 has I. The best one, summed over the folds, is taken; of those that cannot be told from
+it, the one whose training error on all clips is least. So GDLR stops early, and every method has
+its constants from the same evidence.
 
 Only means are adapted; Sigma, lambda and k stay.
 
@@ -41,6 +42,7 @@ Rows = NDArray[np.int64]
 Progress = Callable[[int, int], None]  # called with (steps done, steps in all)
 Candidate = tuple[dict[str, Any], Array]  # constants as JSON values, means (P, d)
 
+ALIKE = 0.01  # validation errors that differ by less cannot be told apart by a few clips
 RIDGES: Final = (1000.0, 300.0, 100.0, 30.0, 10.0, 3.0, 1.0)  # frames; also tau of MAP
 
 
@@ -214,9 +216,10 @@ def _choose(
     whole: _Part,
     trials: list[list[tuple[dict[str, Any], float]]],
 ) -> Adapted:
-    """The candidate of least validation error, of those that exist in every fold and on all clips.
+    """The best candidate, of those that exist in every fold and on all clips.
 
-    A descent that diverges makes fewer.
+    A descent that diverges makes fewer. Of candidates whose validation errors cannot be told from
+    the least one, that of least training error is the best.
     """
     errors = [{json.dumps(constants): error for constants, error in trial} for trial in trials]
     shared = [
@@ -224,15 +227,18 @@ def _choose(
         for constants, mean in candidates
         if all(json.dumps(constants) in fold for fold in errors)
     ]
-    constants, mean, _ = min(shared, key=lambda candidate: candidate[2])
     size, d = whole.z.size, whole.z.shape[1]
+    training = np.array([whole.error(mean, np.eye(d)) for _, mean, _ in shared])
+    validation = np.array([error for _, _, error in shared])
+    alike = validation <= (1 + ALIKE) * validation.min()
+    best = int(np.where(alike, training, np.inf).argmin())
     return Adapted(
-        models=replace(models, mean=mean),
+        models=replace(models, mean=shared[best][1]),
         method=method,
-        constants=constants,
+        constants=shared[best][0],
         candidates=tuple(own for own, _, _ in shared),
-        training=np.array([whole.error(mean, np.eye(d)) for _, mean, _ in shared]) / size,
-        validation=np.array([error for _, _, error in shared]) / len(whole.z),
+        training=training / size,
+        validation=validation / len(whole.z),
         values=size,
     )
 

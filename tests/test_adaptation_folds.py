@@ -115,8 +115,10 @@ def test_gdlr_does_the_same_in_other_units_and_about_another_origin(world):
 
 
 def test_candidates_are_judged_by_what_their_errors_are_worth(world):
-    """One direction alone counts here."""
+    """One direction alone counts here; the others are noise."""
     models, _, clips, _ = world
+    noise = np.random.default_rng(8)
+    clips = [Utterance(u.z + noise.normal(size=u.z.shape) * [0, 0, 4, 4], u.labels) for u in clips]
     direction = np.array([1.0, -1, 0, 0])
     plain = adapt(models, clips, "gdlr")
     seen = adapt(models, clips, "gdlr", weights=np.outer(direction, direction))
@@ -129,7 +131,8 @@ def test_candidates_are_judged_by_what_their_errors_are_worth(world):
         )
         squares += float(np.sum(((left_out.z - y) @ direction) ** 2))
     best, frames = seen.candidates.index(seen.constants), sum(len(u.z) for u in clips)
-    assert seen.validation[best] == seen.validation.min() == pytest.approx(squares / frames)
+    assert seen.validation[best] == pytest.approx(squares / frames)
+    assert seen.validation[best] <= 1.01 * seen.validation.min()
     assert seen.constants != plain.constants
     np.testing.assert_array_equal(seen.training, plain.training)
 
@@ -149,7 +152,8 @@ def test_curves_are_errors_of_candidates_fitted_on_all_and_on_the_other_clips(wo
     adapted = adapt(models, clips, method)
     candidates = len(adapted.candidates)
     assert adapted.training.shape == adapted.validation.shape == (candidates,)
-    best = int(adapted.validation.argmin())
+    alike = np.flatnonzero(adapted.validation <= 1.01 * adapted.validation.min())
+    best = int(min(alike, key=lambda i: adapted.training[i]))
     assert adapted.constants == adapted.candidates[best]
     json.dumps(adapted.candidates, allow_nan=False)
     values = sum(u.z.size for u in clips)
@@ -192,7 +196,7 @@ def test_gdlr_stops_early_where_there_is_little_to_learn():
     training, validation = adapted.training[adapted.path], adapted.validation[adapted.path]
     assert training.shape == validation.shape == (31,)
     assert (np.diff(training) < 0).all()
-    assert adapted.iterations == validation.argmin() < 5
+    assert validation.argmin() <= adapted.iterations < 5
     assert validation[-1] > validation[adapted.iterations]
     assert {own["rate"] for own in adapted.candidates} == set(RULES["bounded"].rates)
 
