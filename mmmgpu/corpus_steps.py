@@ -98,14 +98,14 @@ def finished_step(folder: Path, step: str, piece: Piece) -> dict[str, NDArray[An
 
 
 def track_corpus(
-    folder: Path, corpus: Sequence[Clip], reference: Reference
+    folder: Path, corpus: Sequence[Clip], reference: Reference, *, thumbnails: bool = True
 ) -> tuple[dict[str, Track], dict[str, str]]:
-    """Tracks by clip name, and why other clips were skipped; thumbnails are left in `folder`.
+    """Tracks by clip name, and why other clips were skipped; `Thumbnails` are left in `folder`.
 
     Raises:
         InputError: The head is found in no clip.
     """
-    shared = (folder, reference, mouth_mask(reference.region))
+    shared = (folder, reference, mouth_mask(reference.region) if thumbnails else None)
     for_all(folder, _tracking, shared, "track", "track frames", corpus)
     tracks, skipped = {}, {}
     for clip in corpus:
@@ -122,22 +122,23 @@ def track_corpus(
     return tracks, skipped
 
 
-def _tracking(shared: tuple[Path, Reference, F32]) -> Work:
-    """Keeps the track of a clip and a thumbnail of every frame; or why it must be left out."""
+def _tracking(shared: tuple[Path, Reference, F32 | None]) -> Work:
+    """Keeps the track of a clip and, with a mask, a thumbnail of every frame; or why it must be
+    left out.
+    """
     folder, reference, mask = shared
 
     def work(clip: Clip, tick: Tick) -> None:
         try:
-            track = track_clip(clip.path, reference)
+            track = track_clip(clip.path, reference, tick=tick)
         except InputError as e:
             write_step(folder, f"track-{clip.path.name}", {"skipped": np.array(str(e))})
             return
-        small = []
-        for image in crops(clip.path, track, reference.region):
-            small.append(byte_thumbnail(image, mask))
-            tick()
         arrays = vars(track) | {"residual": np.array(track.residual)}
-        write_step(folder, f"track-{clip.path.name}", {**arrays, "thumbnails": np.array(small)})
+        if mask is not None:
+            images = crops(clip.path, track, reference.region)
+            arrays["thumbnails"] = np.array([byte_thumbnail(image, mask) for image in images])
+        write_step(folder, f"track-{clip.path.name}", arrays)
 
     return work
 

@@ -65,10 +65,11 @@ def regress_means(
         off = total[own] / np.maximum(frames[own, None], 1) - models.mean[own]
         free, scale = _free(models, own, shape)  # (d, m, f), (d, f)
         pull = ridge * weight.sum(axis=0) / frames[own].sum()  # (d,) r v_j
-        gram = np.einsum("jmf,mj,jmh->jfh", free, weight, free)
+        weighted = np.swapaxes(free * weight.T[:, :, None], 1, 2)  # (d, f, m)
+        gram = weighted @ free
         gram += (pull[:, None] * scale)[:, :, None] * np.eye(scale.shape[1])
-        right = np.einsum("jmf,mj,mj->jf", free, weight, off)
-        change = np.linalg.solve(gram, right[:, :, None])[:, :, 0]  # w - w0
+        right = weighted @ off.T[:, :, None]
+        change = np.linalg.solve(gram, right)[:, :, 0]  # w - w0
         mean[own] += np.einsum("jmf,jf->mj", free, change)
     return mean
 

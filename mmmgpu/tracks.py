@@ -3,7 +3,7 @@
 Everything is read one frame at a time; a track is small (a pose a frame) and can be kept.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import tee
 from pathlib import Path
@@ -78,8 +78,10 @@ def _colours(frame: NDArray[np.uint8], points: Floats) -> F32:
     return np.asarray(seen.reshape(-1, 3) / 255, np.float32)
 
 
-def track_clip(path: Path, reference: Reference) -> Track:
-    """Register every frame of the clip at `path` to `reference`.
+def track_clip(
+    path: Path, reference: Reference, *, tick: Callable[[], None] = lambda: None
+) -> Track:
+    """Register every frame of the clip at `path` to `reference`; `tick` is called after each.
 
     Raises:
         InputError: The head was found in less than half of the frames, or the video is unreadable.
@@ -93,6 +95,7 @@ def track_clip(path: Path, reference: Reference) -> Track:
         correlation.append(score)
         if t % COLOUR_EVERY == 0 and score >= MINIMUM_CORRELATION:
             colours.append(_colours(frame, project(pose, reference.colour_points)))
+        tick()
     registered = np.array(correlation) >= MINIMUM_CORRELATION
     if registered.mean() < MINIMUM_SHARE or not colours:
         raise InputError(

@@ -221,7 +221,7 @@ class _Transfer:
 
     def _track(self, reference: Reference) -> tuple[Frames, dict[str, str]]:
         """B's frames as the closed reference frame sees them: its own pose is the identity."""
-        tracks, skipped = track_corpus(self.folder, self.corpus, reference)
+        tracks, skipped = track_corpus(self.folder, self.corpus, reference, thumbnails=False)
         for kind, marked in self.marked.items():
             if marked.pair.b.clip not in tracks:
                 raise InputError(
