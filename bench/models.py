@@ -47,7 +47,7 @@ def matching_work(backends, prototypes=46, frames=450, side=128):
 
     def scan(name, some):
         views = [View(map_, basis.flows[1:][:some], flows)]
-        return FlowScan(basis, views, backend=name)()
+        return FlowScan(basis, views, backend=name)().min(axis=0)
 
     pixels = int((basis.w_f > 0.02).sum())
     return Work(
