@@ -7,25 +7,23 @@ above it. Every thread takes one row.
 
 import warp as wp
 
+from mmmgpu.kernels.lanes import LANES, address, get, one_at
+
 wp.set_module_options({"enable_backward": False})
 
-LANES = 16
-vec16 = wp.types.vector(length=LANES, dtype=float)
 GROUP = wp.constant(4)  # channels unrolled: twice as fast as one loop of unknown length
 
 
 @wp.func
 def at(values: wp.array[float], i: int):
     """values[i] without the questions whether i is negative and values are strided."""
-    here = wp.array(ptr=values.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=float)
-    return here[0]
+    return one_at(address(values, i))
 
 
 @wp.func
 def number_valid(weight: wp.array[float], i: int, threshold: float):
     """How many of 16 neighbours in a row are valid."""
-    here = wp.array(ptr=weight.ptr + wp.uint64(4) * wp.uint64(i), shape=(1,), dtype=vec16)
-    some = here[0]
+    some = get(weight, i)
     n = int(0)
     for j in range(LANES):
         n += wp.where(some[j] >= threshold, 1, 0)

@@ -154,7 +154,7 @@ def _check_corpus(model: Model, corpus: Sequence[Clip]) -> None:
             "convert the clips"
         )
     name, t = model.sources[model.basis.reference]
-    if name not in [clip.path.name for clip in corpus]:
+    if name not in [clip.name for clip in corpus]:
         raise InputError(f"{name}: holds the model's reference frame {t}; give this clip too")
     length = sum(float(clip.info.duration) for clip in corpus)
     if length < LEAST_S:

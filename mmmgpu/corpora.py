@@ -99,6 +99,6 @@ def check_rates(corpus: Sequence[Clip]) -> None:
     for clip in corpus:
         if abs(clip.info.fps / rate - 1) > 0.001:
             raise InputError(
-                f"{clip.path}: has {float(clip.info.fps):g} frames/s but {corpus[0].path.name} "
+                f"{clip.path}: has {float(clip.info.fps):g} frames/s but {corpus[0].name} "
                 f"{float(rate):g}; convert the clips to one rate"
             )

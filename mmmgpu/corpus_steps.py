@@ -132,13 +132,13 @@ def _tracking(shared: tuple[Path, Reference, F32 | None]) -> Work:
         try:
             track = track_clip(clip.path, reference, tick=tick)
         except InputError as e:
-            write_step(folder, f"track-{clip.path.name}", {"skipped": np.array(str(e))})
+            write_step(folder, f"track-{clip.name}", {"skipped": np.array(str(e))})
             return
         arrays = vars(track) | {"residual": np.array(track.residual)}
         if mask is not None:
             images = crops(clip.path, track, reference.region)
             arrays["thumbnails"] = np.array([byte_thumbnail(image, mask) for image in images])
-        write_step(folder, f"track-{clip.path.name}", arrays)
+        write_step(folder, f"track-{clip.name}", arrays)
 
     return work
 
@@ -226,7 +226,7 @@ class Frames:
 
     @property
     def registered(self) -> NDArray[np.bool_]:
-        return np.concatenate([self.tracks[c.path.name].registered for c in self.clips])
+        return np.concatenate([self.tracks[c.name].registered for c in self.clips])
 
     def find(self, i: int) -> tuple[Clip, int]:
         """The clip and its frame that are number `i` of the row."""
@@ -260,9 +260,9 @@ class Frames:
         """The number in the row of frame `t` of the clip called `name`."""
         before = 0
         for clip in self.clips:
-            if clip.path.name == name:
+            if clip.name == name:
                 return before + t
-            before += clip.info.frames
+            before += clip.length
         raise KeyError(name)
 
     def crops(self, numbers: Iterable[int], region: Region) -> dict[int, F32]:
@@ -299,14 +299,14 @@ def rebased_frames(
     first = tracks[name]
     pose = first.poses[t]
     rebased = {n: rebase(track, pose, first.gain, first.offset) for n, track in tracks.items()}
-    return Frames([clip for clip in corpus if clip.path.name in tracks], rebased)
+    return Frames([clip for clip in corpus if clip.name in tracks], rebased)
 
 
 def tracking_notes(frames: Frames, skipped: Mapping[str, str]) -> dict[str, Any]:
     """What tracking found, for reports: JSON values."""
     tracks = frames.tracks.values()
     return {
-        "clips": [clip.path.name for clip in frames.clips],
+        "clips": [clip.name for clip in frames.clips],
         "skipped": dict(skipped),
         "frames": int(frames.registered.size),
         "unregistered_frames": int((~frames.registered).sum()),
@@ -318,7 +318,7 @@ def utterances_of(frames: Frames, coordinates: Sequence[Floats]) -> list[Utteran
     """One stream of every clip, (T, d) each, without the frames whose head was not found."""
     utterances = []
     for clip, z in zip(frames.clips, coordinates, strict=True):
-        good = np.flatnonzero(frames.tracks[clip.path.name].registered)
+        good = np.flatnonzero(frames.tracks[clip.name].registered)
         labels = clip.labels
         utterances.append(Utterance(z[good].astype(np.float64), [labels[t] for t in good]))
     return utterances
@@ -344,9 +344,9 @@ def calmest(frames: Frames) -> Calm:
     """The clip in which the head moves least, as a background."""
 
     def unrest(clip: Clip) -> float:
-        poses = frames.tracks[clip.path.name].poses
+        poses = frames.tracks[clip.name].poses
         return float(np.abs(poses[:, :2, 2] - poses[:, :2, 2].mean(axis=0)).mean())
 
     clip = min(frames.clips, key=unrest)
     data = np.fromfile(clip.path, np.uint8)
-    return Calm(data, clip.path.suffix, frames.tracks[clip.path.name])
+    return Calm(data, clip.path.suffix, frames.tracks[clip.name])

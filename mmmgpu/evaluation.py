@@ -96,7 +96,7 @@ def evaluate(
     points = None if landmarks is None else _lip_points(model, corpus, Path(landmarks))
     with one_thread_each():
         spoken = [_speak(model, clip, backend) for clip in corpus]
-    result: dict[str, Any] = {"clips": [clip.path.name for clip in corpus]}
+    result: dict[str, Any] = {"clips": [clip.name for clip in corpus]}
     seen = sorted(set(result["clips"]) & set(model.notes.get("clips", [])))
     if seen:
         result["also_in_training"] = seen
@@ -201,7 +201,7 @@ def _lip_points(model: Model, corpus: Sequence[Clip], folder: Path) -> tuple[Flo
             f"{folder}: the landmarks of {name} end before frame {t}, the model's reference; "
             "give those of the clips that the model was trained on"
         )
-    real = [read_landmarks(folder, clip.path, clip.info.frames)[:, LIPS] for clip in corpus]
+    real = [read_landmarks(folder, clip.path, clip.length)[:, LIPS] for clip in corpus]
     return origin[t, LIPS], real
 
 
@@ -275,7 +275,7 @@ def _picture_errors(model: Model, s: _Spoken, synthesizer: Synthesizer) -> dict[
     alpha = np.stack([s.made[kind, "alpha"] for kind in kinds], axis=1)
     beta = np.stack([focused(project_on_simplex(s.made[kind, "beta"])) for kind in kinds], axis=1)
     errors = []
-    label, total = f"render {s.clip.path.name}", int(s.speech.sum())
+    label, total = f"render {s.clip.name}", int(s.speech.sum())
     seen = zip(s.speech, alpha, beta, crops(s.clip.path, track, basis.region), strict=False)
     frames = ((a, b, real) for spoken, a, b, real in seen if spoken)
     for a, b, real in progress(frames, label, total=total):

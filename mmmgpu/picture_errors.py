@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.basis import F32, Basis
+from mmmgpu.components import gram_of
 from mmmgpu.operations import sample
 
 Floats = NDArray[np.float64]
@@ -35,4 +36,4 @@ def texture_weights(basis: Basis, *, backend: str = "warp") -> Floats:
 def _gram(fields: F32, mask: F32) -> Floats:
     """Products of fields (n, h, w, c), summed over c, in the mean under a mask (h, w): (n, n)."""
     shown = (fields * np.sqrt(mask)[..., None]).reshape(len(fields), -1)
-    return np.asarray(shown @ shown.T / mask.sum(), np.float64)
+    return np.asarray(gram_of(shown) / mask.sum())

@@ -127,21 +127,21 @@ def choose_references(
         numbers = {CLOSED: _most_usual(frames, reference.region, sync)}
         numbers[OPEN] = _most_open_frame(frames, reference.region, numbers[CLOSED])
     places = {kind: frames.find(i) for kind, i in numbers.items()}
-    by_name = {clip.path.name: clip for clip in frames.clips}
+    by_name = {clip.name: clip for clip in frames.clips}
     for kind, (name, t) in given.items():
         if name not in by_name:
             raise InputError(f"{name}: the head was not found in this clip; choose another frame")
         places[kind] = (by_name[name], t)
     shown = {}
     for kind, (clip, t) in places.items():
-        name = clip.path.name
+        name = clip.name
         mouth = _carried(reference.region, frames.tracks[name].poses[t])
         shown[kind] = ShownFrame(name, t, frame_at(clip.path, t), mouth)
     return shown
 
 
 def _check_given(corpus: Sequence[Clip], given: Mapping[str, tuple[str, int]]) -> None:
-    frames = {clip.path.name: clip.info.frames for clip in corpus}
+    frames = {clip.name: clip.length for clip in corpus}
     for kind, (name, t) in given.items():
         if t >= frames.get(name, 0):
             raise InputError(
@@ -161,13 +161,13 @@ def _tracked(corpus: Sequence[Clip], reference: Reference) -> Frames:
     with progress_bar(len(corpus), "find the head") as advance:
         for clip in corpus:
             try:
-                tracks[clip.path.name] = track_clip(clip.path, reference)
+                tracks[clip.name] = track_clip(clip.path, reference)
             except InputError as e:
                 reasons.append(e)
             advance(1)
     if not tracks:
         raise reasons[0]
-    return Frames([clip for clip in corpus if clip.path.name in tracks], tracks)
+    return Frames([clip for clip in corpus if clip.name in tracks], tracks)
 
 
 def _most_usual(frames: Frames, region: Region, sync: float) -> int:
@@ -175,9 +175,9 @@ def _most_usual(frames: Frames, region: Region, sync: float) -> int:
     mask = mouth_mask(region)
     small, sound = [], []
     for clip in frames.clips:
-        images = crops(clip.path, frames.tracks[clip.path.name], region)
+        images = crops(clip.path, frames.tracks[clip.name], region)
         small.append(np.stack([byte_thumbnail(image, mask) for image in images]))
-        count = clip.info.frames
+        count = clip.length
         sound.append(loudness(clip, count, sync) if clip.info.has_sound else np.zeros(count))
     usable, loud = frames.registered, np.concatenate(sound)
     quiet = (loud <= np.quantile(loud[usable], QUIET)) & usable
@@ -190,7 +190,7 @@ def _most_open_frame(frames: Frames, region: Region, closed: int) -> int:
     origin = frames.crops([closed], region)[closed]
     scores = []
     for clip in frames.clips:
-        track = frames.tracks[clip.path.name]
+        track = frames.tracks[clip.name]
         for image, usable in zip(crops(clip.path, track, region), track.registered, strict=True):
             flow = match(origin, image)
             scores.append(openness(flow, region, weight) if usable else -np.inf)

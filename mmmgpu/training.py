@@ -105,15 +105,15 @@ class _Training:
     def run(self) -> Model:
         provisional = find_reference(self.corpus, self.options.region, sync=self.options.sync)
         tracks, skipped = track_corpus(self.folder, self.corpus, provisional)
-        used = [clip for clip in self.corpus if clip.path.name in tracks]
+        used = [clip for clip in self.corpus if clip.name in tracks]
         frames = Frames(used, tracks)
         chosen, reference_frame, coordinates = self._choose(frames)
         clip, t = frames.find(reference_frame)
         size = (clip.info.width, clip.info.height)
-        first = tracks[clip.path.name]
+        first = tracks[clip.name]
         kept = self.options.region is not None
         reference = rebase_reference(provisional, first, t, size, keep_box=kept)
-        frames = rebased_frames(used, tracks, clip.path.name, t)
+        frames = rebased_frames(used, tracks, clip.name, t)
         flow = self.options.flow
         basis = prototype_basis(
             frames, reference.region, chosen, reference_frame, coordinates, flow=flow

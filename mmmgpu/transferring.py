@@ -132,7 +132,7 @@ class _Marked:
 def _marked_frames(source: Model, corpus: Sequence[Clip], path: Path) -> dict[str, _Marked]:
     """The frames that the points at `path` are of, by kind."""
     marked = {}
-    by_name = {clip.path.name: clip for clip in corpus}
+    by_name = {clip.name: clip for clip in corpus}
     for pair in read_points(path):
         where = f"{path}: {pair.kind} pair"
         place = (pair.a.clip, pair.a.frame)
@@ -148,7 +148,7 @@ def _marked_frames(source: Model, corpus: Sequence[Clip], path: Path) -> dict[st
                 "model; mark the points again with this model"
             )
         clip = by_name.get(pair.b.clip)
-        if clip is None or not 0 <= pair.b.frame < clip.info.frames:
+        if clip is None or not 0 <= pair.b.frame < clip.length:
             raise InputError(
                 f"{where}: frame {pair.b.frame} of {pair.b.clip} is not among the clips; give "
                 "the clip too, or mark the points again"
