@@ -183,6 +183,20 @@ def test_crops_are_the_crop_of_every_frame(world, reference, tracks):
         )
 
 
+def test_crops_of_a_stretch_are_those_of_the_clip(world, reference, tracks):
+    pictures = list(crops(world.clips[1], tracks[1], reference.region))
+    stretch = list(crops(world.clips[1], tracks[1], reference.region, start=5, stop=9))
+    np.testing.assert_array_equal(stretch, pictures[5:9])
+    rest = list(crops(world.clips[1], tracks[1], reference.region, start=len(pictures) - 2))
+    np.testing.assert_array_equal(rest, pictures[-2:])
+
+
+def test_tracking_tells_of_every_frame(world, reference):
+    ticks = []
+    track = track_clip(world.clips[0], reference, tick=lambda: ticks.append(None))
+    assert len(ticks) == len(track)
+
+
 def test_stabilised_crops_hold_still(world, reference, tracks):
     """Cheeks beside the mouth stay where they are although the head moves."""
     wide = Region((20, 60, 100, 40), reference.region.mouth)
