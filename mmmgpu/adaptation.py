@@ -8,6 +8,7 @@ Then the means are adapted to B's own trajectories, class by class (Eq. 14-17, `
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,31 +16,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.adaptation_folds import METHODS, Adapted, adapt_models
-from mmmgpu.analysis import analyze, prepare_analysis
-from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.basis import Basis
 from mmmgpu.corpora import Clip, check_rates, open_corpus
 from mmmgpu.corpus_steps import (
     Frames,
+    Pictures,
+    Seen,
     Thumbnails,
-    analyse_corpus,
+    analyse,
     calmest,
     fit_dynamics,
+    fit_streams,
     make_model,
     rebased_frames,
     track_corpus,
     tracking_notes,
     utterances_of,
 )
+from mmmgpu.dynamics import Dynamics
 from mmmgpu.errors import InputError
 from mmmgpu.flows import MATCHERS
 from mmmgpu.gdlr import RULES, Descent
 from mmmgpu.models import Model
-from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.phonemes import PhonemeModels, Utterance, coverage
 from mmmgpu.phones import CE05_PHONES, SIL, ce05_phone
 from mmmgpu.picture_errors import flow_weights, texture_weights
-from mmmgpu.progress import progress_bar
+from mmmgpu.processes import Tick
 from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, principal_coordinates
 from mmmgpu.regression_classes import Classes, broad_classes, kmeans_classes, paper_classes
@@ -182,46 +184,37 @@ class _Adaptation:
         tracks, skipped = track_corpus(self.folder, self.corpus, model.reference)
         frames = rebased_frames(self.corpus, tracks, *model.sources[model.basis.reference])
         chosen, basis = self._reselect(frames)
-        to_new = self._old_in_new(basis)
-        before = tuple(
-            carry(stream.trained, matrix, covariance=options.covariance)
-            for stream, matrix in zip((model.alpha, model.beta), to_new, strict=True)
-        )
-        classes = self._classes(before)
-        analysed = analyse_corpus(
-            self.folder, frames, basis, flow=options.flow, backend=self.backend
-        )
-        spoken = [utterances_of(frames, z) for z in analysed]
-        streams, others = [], []
-        curves: dict[str, Any] = {}
+        to_new, analysed = self._analyse(frames, basis)
         weights = flow_weights(basis), texture_weights(basis, backend=self.backend)
-        for name, old, carried, utterances, seen in zip(
-            ("alpha", "beta"), (model.alpha, model.beta), before, spoken, weights, strict=True
-        ):
-            smoothness = scaled_smoothness(carried, old.constants.smoothness)
-            start = replace(old, pooled=carried, trained=carried, smoothness=smoothness)
-            results = self._adapt(name, start, utterances, classes, seen)
-            best = results[options.method]
-            streams.append(_adapted_stream(start, best))
-            others.append({method: found.models.mean for method, found in results.items()})
-            curves[name] = {method: _curve(found) for method, found in results.items()}
+        starts = [
+            _Start(_carried(old, matrix, options.covariance), utterances_of(frames, z), seen)
+            for old, matrix, z, seen in zip(
+                (model.alpha, model.beta), to_new, analysed, weights, strict=True
+            )
+        ]
+        classes = self._classes([start.stream.trained for start in starts])
+        found, dynamics = fit_streams(partial(_adapt, options, classes), starts, "adapt")
+        alpha, beta = (
+            _adapted_stream(start.stream, results[options.method])
+            for start, results in zip(starts, found, strict=True)
+        )
         whole, sources = frames.pictures(chosen)
         return Model(
             basis=basis,
             reference=model.reference,
-            alpha=streams[0],
-            beta=streams[1],
+            alpha=alpha,
+            beta=beta,
             fps=model.fps,
             prototype_frames=whole,
             sources=sources,
             calm=calmest(frames),
-            notes=self._notes(frames, skipped, classes, curves),
+            notes=self._notes(frames, skipped, classes, found),
             alternatives={
-                m: (others[0][m], others[1][m])
+                m: (found[0][m].models.mean, found[1][m].models.mean)
                 for m in METHODS
                 if m not in ("none", options.method)
             },
-            dynamics=fit_dynamics(*spoken),
+            dynamics=dynamics,
         )
 
     def _reselect(self, frames: Frames) -> tuple[NDArray[np.int64], Basis]:
@@ -238,17 +231,24 @@ class _Adaptation:
         basis = prototype_basis(frames, region, chosen, origin, coordinates, flow=self.options.flow)
         return chosen, replace(basis, w_f=self.model.basis.w_f, w_t=self.model.basis.w_t)
 
-    def _old_in_new(self, basis: Basis) -> tuple[Floats, Floats]:
-        """Eq. 11-12: A (M' - 1, M - 1) and B (M', M); column k is old prototype k in the new."""
-        old, kernels = self.model.basis, get_backend(self.backend, 1)
-        analyzer = prepare_analysis(basis, kernels, flow=self.options.flow)
+    def _analyse(
+        self, frames: Frames, basis: Basis
+    ) -> tuple[tuple[Floats, Floats], tuple[list[Floats], list[Floats]]]:
+        """The old prototypes and the clips in the new ones.
 
-        def one(image: F32, _: Cancelled) -> tuple[Floats, Floats]:
-            return analyze(analyzer, image)
-
-        found = list(map_ordered(one, old.images, threads=default_threads()))
-        alpha = np.stack([a for a, _ in found], axis=1)[:, old.moving]
-        return alpha, np.stack([b for _, b in found], axis=1)
+        Eq. 11-12, A (M' - 1, M - 1) and B (M', M): column k is old prototype k. Then alpha and beta
+        of every clip.
+        """
+        old, stretches = self.model.basis, frames.stretches
+        halves = np.array_split(old.images, 2)  # as stretches are, for all processes to have some
+        own = [Pictures(f"prototypes-{i}", half) for i, half in enumerate(halves)]
+        pieces: list[Seen] = [*own, *stretches]
+        flow, backend = self.options.flow, self.backend
+        found = analyse(self.folder, pieces, basis, flow=flow, backend=backend)
+        alphas, betas = zip(*found, strict=True)
+        a, b = (np.concatenate(of[: len(own)]).T.astype(np.float64) for of in (alphas, betas))
+        clips = [frames.by_clip(of[len(own) :]) for of in (alphas, betas)]
+        return (a[:, old.moving], b), (clips[0], clips[1])
 
     def _classes(self, before: Sequence[PhonemeModels]) -> Classes:
         """The phones that move together."""
@@ -258,42 +258,12 @@ class _Adaptation:
             return paper_classes(before[0].labels)
         return kmeans_classes(*before, count=CLASS_COUNT, seed=self.options.seed)
 
-    def _adapt(
-        self,
-        name: str,
-        start: TrainedStream,
-        utterances: Sequence[Utterance],
-        classes: Classes,
-        weights: Floats,
-    ) -> dict[str, Adapted]:
-        """One stream by every method, and by GDLR with the step that was not chosen."""
-        with progress_bar(None, f"adapt {name}") as advance:
-
-            def by(method: str, step: str) -> Adapted:
-                return adapt_models(
-                    start.pooled,
-                    utterances,
-                    smoothness=start.smoothness,
-                    order=start.constants.order,
-                    method=method,
-                    classes=classes,
-                    rng=np.random.default_rng(self.options.seed),
-                    weights=weights,
-                    descent=Descent(rule=step),
-                    progress=lambda done, total: advance(1),
-                )
-
-            step = self.options.step
-            (other,) = (rule for rule in RULES if rule != step)
-            results = {method: by(method, step) for method in METHODS}
-            return results | {OTHER_STEP: by("gdlr", other)}
-
     def _notes(
         self,
         frames: Frames,
         skipped: Mapping[str, str],
         classes: Classes,
-        curves: Mapping[str, Any],
+        found: Sequence[Mapping[str, Adapted]],
     ) -> dict[str, Any]:
         kept = ("transferred_from", "matching")
         return {
@@ -308,9 +278,53 @@ class _Adaptation:
                 "step": self.options.step,
                 "classes": [list(members) for members in classes],
                 "coverage": _coverage(frames),
-                "curves": dict(curves),
+                "curves": {
+                    name: {method: _curve(of) for method, of in results.items()}
+                    for name, results in zip(("alpha", "beta"), found, strict=True)
+                },
             },
         }
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A stream before adaptation; what the clips show of it; and W, what errors in it count."""
+
+    stream: TrainedStream
+    utterances: Sequence[Utterance]
+    weights: Floats
+
+
+def _carried(old: TrainedStream, matrix: Floats, covariance: str) -> TrainedStream:
+    """A stream in the new prototypes (Eq. 13)."""
+    models = carry(old.trained, matrix, covariance=covariance)
+    smoothness = scaled_smoothness(models, old.constants.smoothness)
+    return replace(old, pooled=models, trained=models, smoothness=smoothness)
+
+
+def _adapt(
+    options: AdaptOptions, classes: Classes, start: _Start, tick: Tick
+) -> tuple[dict[str, Adapted], dict[str, Dynamics]]:
+    """One stream by every method, and by GDLR with the step not chosen; and its other movements."""
+
+    def by(method: str, step: str) -> Adapted:
+        return adapt_models(
+            start.stream.pooled,
+            start.utterances,
+            smoothness=start.stream.smoothness,
+            order=start.stream.constants.order,
+            method=method,
+            classes=classes,
+            rng=np.random.default_rng(options.seed),
+            weights=start.weights,
+            descent=Descent(rule=step),
+            progress=lambda done, total: tick(),
+        )
+
+    (other,) = (rule for rule in RULES if rule != options.step)
+    results = {method: by(method, options.step) for method in METHODS}
+    results[OTHER_STEP] = by("gdlr", other)
+    return results, fit_dynamics(start.utterances, tick)
 
 
 def _coverage(frames: Frames) -> dict[str, Any]:

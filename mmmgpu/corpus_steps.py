@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from mmmgpu.errors import InputError
 from mmmgpu.models import REGULARISED, Calm, Model
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phonemes import Utterance
-from mmmgpu.processes import Tick, Work, share_out
+from mmmgpu.processes import Tick, Work, map_out, share_out
 from mmmgpu.progress import progress_bar
 from mmmgpu.regions import Region, mouth_mask
 from mmmgpu.tracks import Reference, Track, crop, crops, rebase, track_clip
@@ -38,6 +38,8 @@ from mmmgpu.videos import read_chosen_frames
 
 Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
+T = TypeVar("T")
+R = TypeVar("R")
 
 STRETCHES = 8  # at least, of a corpus: to decode up to one costs little beside analysing it
 
@@ -143,36 +145,45 @@ def _tracking(shared: tuple[Path, Reference, F32 | None]) -> Work:
     return work
 
 
+class Seen(Piece, Protocol):
+    """A piece that can be seen."""
+
+    def crops(self, region: Region) -> Iterable[F32]: ...
+
+
 def analyse_corpus(
     folder: Path, frames: "Frames", basis: Basis, *, flow: str, backend: str
 ) -> tuple[list[Floats], list[Floats]]:
     """alpha (T, M - 1) and beta (T, M) of every clip of `frames`."""
+    found = analyse(folder, frames.stretches, basis, flow=flow, backend=backend)
+    alpha, beta = (frames.by_clip(parts) for parts in zip(*found, strict=True))
+    return alpha, beta
+
+
+def analyse(
+    folder: Path, pieces: Sequence[Seen], basis: Basis, *, flow: str, backend: str
+) -> list[tuple[Floats, Floats]]:
+    """alpha (T, M - 1) and beta (T, M) of the T frames of every piece."""
     shared = (folder, basis, flow, backend)
-    for_all(folder, _analysing, shared, "analysis", "analyse frames", frames.stretches)
-    alpha: dict[str, list[Floats]] = {clip.name: [] for clip in frames.clips}
-    beta: dict[str, list[Floats]] = {clip.name: [] for clip in frames.clips}
-    for stretch in frames.stretches:
-        done = finished_step(folder, "analysis", stretch)
-        alpha[stretch.clip.name].append(done["alpha"])
-        beta[stretch.clip.name].append(done["beta"])
-    whole = [[np.concatenate(found) for found in of.values()] for of in (alpha, beta)]
-    return whole[0], whole[1]
+    for_all(folder, _analysing, shared, "analysis", "analyse frames", pieces)
+    done = [finished_step(folder, "analysis", piece) for piece in pieces]
+    return [(found["alpha"], found["beta"]) for found in done]
 
 
 def _analysing(shared: tuple[Path, Basis, str, str]) -> Work:
-    """Keeps alpha and beta of every frame of a stretch."""
+    """Keeps alpha and beta of every frame of a piece."""
     folder, basis, flow, backend = shared
     analyzer = prepare_analysis(basis, get_backend(backend, 1), flow=flow)
 
-    def work(stretch: Stretch, tick: Tick) -> None:
+    def work(piece: Seen, tick: Tick) -> None:
         alpha, beta = [], []
-        for image in stretch.crops(basis.region):
+        for image in piece.crops(basis.region):
             a, b = analyze(analyzer, image)
             alpha.append(a)
             beta.append(b)
             tick()
         arrays = {"alpha": np.array(alpha, np.float32), "beta": np.array(beta, np.float32)}
-        write_step(folder, f"analysis-{stretch.name}", arrays)
+        write_step(folder, f"analysis-{piece.name}", arrays)
 
     return work
 
@@ -201,6 +212,23 @@ class Stretch:
     def crops(self, region: Region) -> Iterator[F32]:
         """The region of each frame, (h, w, 3)."""
         return crops(self.clip.path, self.track, region, start=self.start, stop=self.stop)
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Some pictures (n, h, w, 3) of a region, to be seen as if they were frames."""
+
+    name: str
+    images: F32
+
+    @property
+    def length(self) -> int:
+        return len(self.images)
+
+    def crops(self, region: Region) -> Iterator[F32]:
+        """The pictures, which are of `region`."""
+        assert self.images.shape[1:3] == region.shape
+        return iter(self.images)
 
 
 @dataclass(frozen=True)
@@ -246,6 +274,13 @@ class Frames:
             track = self.tracks[clip.name]
             found += [Stretch(clip, track, *ends[part : part + 2]) for part in range(parts)]
         return found
+
+    def by_clip(self, parts: Sequence[Floats]) -> list[Floats]:
+        """What was found for the stretches, (t, d) each, joined to one (T, d) a clip."""
+        found: dict[str, list[Floats]] = {clip.name: [] for clip in self.clips}
+        for stretch, part in zip(self.stretches, parts, strict=True):
+            found[stretch.clip.name].append(part)
+        return [np.concatenate(of) for of in found.values()]
 
     def pictures(
         self, numbers: Iterable[int]
@@ -324,20 +359,29 @@ def utterances_of(frames: Frames, coordinates: Sequence[Floats]) -> list[Utteran
     return utterances
 
 
-def fit_dynamics(
-    alpha: Sequence[Utterance], beta: Sequence[Utterance]
-) -> dict[str, tuple[Dynamics, Dynamics]]:
-    """Of each stream, the `FIVE` models of movement but `REGULARISED`, which is fitted apart."""
-    names = [name for name in FIVE if name != REGULARISED]
-    with progress_bar(2 * len(names), "fit other movements") as advance:
+def fit_streams(
+    fit: Callable[[T, Tick], tuple[R, dict[str, Dynamics]]], streams: Sequence[T], label: str
+) -> tuple[list[R], dict[str, tuple[Dynamics, Dynamics]]]:
+    """What `fit` finds for both streams, alpha and beta, each in a process of its own.
 
-        def fit(name: str, utterances: Sequence[Utterance]) -> Dynamics:
-            some = [u for u in utterances if len(u.z)]
-            model = MODELS[name].fit([u.z for u in some], [u.labels for u in some])
-            advance(1)
-            return model
+    `fit` is as `map_out` takes it; `label` names the progress bar.
+    """
+    with progress_bar(None, label) as advance:
+        found = map_out(fit, streams, processes=default_threads(), advance=advance)
+    (first, alpha), (second, beta) = found
+    return [first, second], {name: (alpha[name], beta[name]) for name in alpha}
 
-        return {name: (fit(name, alpha), fit(name, beta)) for name in names}
+
+def fit_dynamics(utterances: Sequence[Utterance], tick: Tick) -> dict[str, Dynamics]:
+    """The `FIVE` models of movement of one stream but `REGULARISED`, which is fitted apart."""
+    some = [u for u in utterances if len(u.z)]
+
+    def fit(name: str) -> Dynamics:
+        model = MODELS[name].fit([u.z for u in some], [u.labels for u in some])
+        tick()
+        return model
+
+    return {name: fit(name) for name in FIVE if name != REGULARISED}
 
 
 def calmest(frames: Frames) -> Calm:

@@ -2,7 +2,8 @@
 
 Unlike `multiprocessing`, calling scripts need no ``if __name__ == "__main__"``: a child is a plain
 ``python -m mmmgpu.processes`` that is told over its standard input what to do and answers with one
-byte for every piece of work done. Results go to files (see `mmmgpu.checkpoints`).
+byte for every piece of work done. Results go to files: finished steps (see `mmmgpu.checkpoints`),
+or with `map_out` such as nobody else sees.
 """
 
 import os
@@ -11,12 +12,16 @@ import selectors
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
 
 from mmmgpu.errors import InputError
 
 Tick = Callable[[], None]
 Work = Callable[[Any, Tick], None]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 ONE_THREAD = dict.fromkeys(
     ("MMMGPU_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT"), "1"
@@ -54,6 +59,37 @@ def share_out(
         for child in children:
             child.kill()
             child.communicate()
+
+
+def map_out(
+    function: Callable[[Item, Tick], Result],
+    items: Sequence[Item],
+    *,
+    processes: int,
+    advance: Callable[[int], None],
+) -> list[Result]:
+    """``function(item, tick)`` of every item, in order, from processes as `share_out` has them.
+
+    `function` is one at the top of a module, or a `functools.partial` of one.
+    """
+    with TemporaryDirectory() as folder:
+        numbered = list(enumerate(items))
+        share_out(_keeping, (function, folder), numbered, processes=processes, advance=advance)
+        return [pickle.loads(_kept(folder, i).read_bytes()) for i, _ in numbered]
+
+
+def _keeping(shared: tuple[Callable[[Any, Tick], Any], str]) -> Work:
+    function, folder = shared
+
+    def work(numbered: tuple[int, Any], tick: Tick) -> None:
+        i, item = numbered
+        _kept(folder, i).write_bytes(pickle.dumps(function(item, tick)))
+
+    return work
+
+
+def _kept(folder: str, i: int) -> Path:
+    return Path(folder, f"{i}.pickle")
 
 
 def _start(

@@ -8,6 +8,7 @@ result until the job is done; in memory stay the PCA and model coordinates of th
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +22,18 @@ from mmmgpu.corpus_steps import (
     analyse_corpus,
     calmest,
     fit_dynamics,
+    fit_streams,
     make_model,
     rebased_frames,
     track_corpus,
     tracking_notes,
     utterances_of,
 )
+from mmmgpu.dynamics import Dynamics
 from mmmgpu.models import Model
 from mmmgpu.phonemes import Utterance
 from mmmgpu.phones import SIL
-from mmmgpu.progress import progress_bar
+from mmmgpu.processes import Tick
 from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordinates
 from mmmgpu.references import check_sound, find_reference, rebase_reference
@@ -120,18 +123,21 @@ class _Training:
         )
         alphas, betas = analyse_corpus(self.folder, frames, basis, flow=flow, backend=self.backend)
         spoken = [utterances_of(frames, stream) for stream in (alphas, betas)]
+        (alpha, beta), dynamics = fit_streams(
+            partial(_learn, self.options.seed), spoken, "train phonemes"
+        )
         whole, sources = frames.pictures(chosen)
         return Model(
             basis=basis,
             reference=reference,
-            alpha=self._phonemes("alpha", spoken[0]),
-            beta=self._phonemes("beta", spoken[1]),
+            alpha=alpha,
+            beta=beta,
             fps=used[0].info.fps,
             prototype_frames=whole,
             sources=sources,
             calm=calmest(frames),
             notes=_notes(frames, skipped, self.options),
-            dynamics=fit_dynamics(*spoken),
+            dynamics=dynamics,
         )
 
     def _choose(self, frames: Frames) -> tuple[NDArray[np.int64], int, F32]:
@@ -145,11 +151,14 @@ class _Training:
         neutral = most_neutral(coordinates[usable], chosen, silent[usable])
         return usable[chosen], int(usable[chosen[neutral]]), coordinates
 
-    def _phonemes(self, name: str, utterances: Sequence[Utterance]) -> TrainedStream:
-        """The phoneme models of one stream, from the frames whose head was found."""
-        rng = np.random.default_rng(self.options.seed)
-        with progress_bar(None, f"train {name}") as advance:
-            return fit_stream(utterances, rng=rng, progress=lambda done, total: advance(1))
+
+def _learn(
+    seed: int, utterances: Sequence[Utterance], tick: Tick
+) -> tuple[TrainedStream, dict[str, Dynamics]]:
+    """The phoneme models and other movements of one stream, from frames whose head was found."""
+    rng = np.random.default_rng(seed)
+    trained = fit_stream(utterances, rng=rng, progress=lambda done, total: tick())
+    return trained, fit_dynamics(utterances, tick)
 
 
 def _notes(frames: Frames, skipped: Mapping[str, str], options: Options) -> dict[str, Any]:

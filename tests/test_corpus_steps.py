@@ -3,7 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mmmgpu.corpus_steps import Frames
+from mmmgpu.corpus_steps import Frames, Pictures
+from mmmgpu.regions import Region
 
 
 def row_of(*lengths):
@@ -28,3 +29,23 @@ def test_stretches_hold_every_frame_once_and_in_order(lengths, count):
 def test_the_stretches_of_a_clip_are_of_about_one_length():
     lengths = {s.length for s in row_of(1000, 1000, 1001).stretches}
     assert lengths <= {333, 334}
+
+
+@pytest.mark.parametrize("lengths", [(75,) * 5, (3,), (20, 1, 7)])
+def test_what_stretches_hold_is_joined_by_clip(lengths):
+    frames = row_of(*lengths)
+    parts = [np.stack([s.registered, s.registered**2], axis=1) for s in frames.stretches]
+    whole = frames.by_clip(parts)
+    assert len(whole) == len(lengths)
+    for found, n in zip(whole, lengths, strict=True):
+        np.testing.assert_array_equal(found, np.stack([np.arange(n), np.arange(n) ** 2], axis=1))
+
+
+def test_pictures_are_seen_like_frames_of_their_region():
+    region = Region((40, 30, 6, 4), (43.0, 32.0, 4.0))
+    images = np.random.default_rng(0).random((5, 4, 6, 3), np.float32)
+    pictures = Pictures("old", images)
+    assert pictures.length == 5
+    np.testing.assert_array_equal(np.stack(list(pictures.crops(region))), images)
+    with pytest.raises(AssertionError):
+        pictures.crops(Region((40, 30, 5, 4), (43.0, 32.0, 4.0)))

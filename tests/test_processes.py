@@ -1,13 +1,15 @@
 import contextlib
 import os
+import tempfile
 import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mmmgpu.errors import InputError
-from mmmgpu.processes import share_out
+from mmmgpu.processes import map_out, share_out
 
 WAIT_S = 60  # at most, for another process
 
@@ -113,6 +115,36 @@ def test_a_failure_arrives_and_the_others_are_stopped(tmp_path, fail, error, say
     with pytest.raises(error, match=says):
         share_out(partial(failing, fail), str(tmp_path), order, processes=2, advance=lambda n: None)
     assert has_ended(tmp_path)
+
+
+def powers(base, exponents, tick):
+    """Arrays of so many powers, and which process found them."""
+    for _ in exponents:
+        tick()
+    return np.power(float(base), exponents), os.getpid()
+
+
+@pytest.mark.parametrize(("processes", "used"), [(1, 1), (2, 2), (9, 3)])
+def test_results_come_back_whole_and_in_order(processes, used):
+    ticks, items = [], [(0, 1, 2), (), (0.5,)]
+    found = map_out(partial(powers, 9), items, processes=processes, advance=ticks.append)
+    for (values, _), expected in zip(found, [[1, 9, 81], [], [3]], strict=True):
+        np.testing.assert_array_equal(values, expected)
+    pids = {pid for _, pid in found}
+    assert len(pids) == used
+    assert os.getpid() not in pids
+    assert sum(ticks) == 4
+
+
+def refusing(item, tick):
+    refuse()
+
+
+def test_a_failure_of_one_of_many_arrives(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(InputError, match="is odd!; leave it out"):
+        map_out(refusing, [1, 2, 3], processes=2, advance=lambda n: None)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_error_while_preparing_arrives(tmp_path):
