@@ -1,7 +1,7 @@
 /* Vectors of 16 neighbours in a row of a plane, and what kernels do with them lane by lane.
  *
  * A plane is one channel of a picture in rows padded to whole vectors; a padded row is a pitch.
- * Operators alone: PoCL calls its functions of 16 lanes, and inlines none.
+ * Operators and clang's own functions alone: PoCL calls its functions of 16 lanes, and inlines none.
  */
 
 #define FAR 1.0e8f /* [px] beyond any picture, inside int */
@@ -48,12 +48,17 @@ int16 whole(const float16 q)
     return n + (convert_float16(n) > q);
 }
 
+/* Where clang knows what is asked, whether any lane of a comparison is set takes two instructions. */
 int least(const int16 n)
 {
+#if __has_builtin(__builtin_reduce_min)
+    return __builtin_reduce_min(n);
+#else
     const int8 a = n.lo < n.hi ? n.lo : n.hi;
     const int4 b = a.lo < a.hi ? a.lo : a.hi;
     const int2 c = b.lo < b.hi ? b.lo : b.hi;
     return c.x < c.y ? c.x : c.y;
+#endif
 }
 
 float least_value(const float16 n)

@@ -10,7 +10,13 @@ float16 near(const float16 off)
     return 1.0f - as_float16(as_int16(off) & 0x7fffffff);
 }
 
-/* The flow that is missing to prototype m, for each of its pixels, in one frame or two. */
+/* A share of the flow that is missing at a pixel, in one direction and frame. */
+float16 missing(__global const float *field, const float16 share, const float16 q)
+{
+    return share * (get(field) - q);
+}
+
+/* The flow that is missing to prototype m, for each of its pixels, in 1, 2 or 4 frames. */
 void orient(const int m, __global const float *own, __global const float *shares,
             __global const int *firsts, __global const int *neighbours, __global const int *rows,
             __global const int *targets, __global const int *starts, __global const int *row_taps,
@@ -18,16 +24,20 @@ void orient(const int m, __global const float *own, __global const float *shares
             const int together, __global const float *field, __global float *residual)
 {
     const int vectors = area / LANES;
-    __global const float *next = field + 2 * (area + LANES);
+    const int frame = 2 * (area + LANES);
     own += 2 * m * area;
     shares += m * area;
     firsts += m * vectors;
     for (int v = 0; v < vectors; ++v) {
         const int i = LANES * v;
-        float16 x = (float16)0.0f;
-        float16 y = (float16)0.0f;
-        float16 next_x = (float16)0.0f;
-        float16 next_y = (float16)0.0f;
+        float16 x0 = (float16)0.0f;
+        float16 y0 = (float16)0.0f;
+        float16 x1 = (float16)0.0f;
+        float16 y1 = (float16)0.0f;
+        float16 x2 = (float16)0.0f;
+        float16 y2 = (float16)0.0f;
+        float16 x3 = (float16)0.0f;
+        float16 y3 = (float16)0.0f;
         for (int k = firsts[v]; k < firsts[v + 1]; ++k) {
             const int right = neighbours[3 * k];
             const int down = neighbours[3 * k + 1];
@@ -36,19 +46,35 @@ void orient(const int m, __global const float *own, __global const float *shares
             const float16 qy = get(own + area + s);
             const int16 given = ((int16)neighbours[3 * k + 2] & (int16)1 << LANE) != 0;
             const float16 share = given ? near(qx + right) * near(qy + down) : (float16)0.0f;
-            x += share * (get(field + s) - qx);
-            y += share * (get(field + area + s) - qy);
+            __global const float *at = field + s;
+            x0 += missing(at, share, qx);
+            y0 += missing(at + area, share, qy);
             if (together > 1) {
-                next_x += share * (get(next + s) - qx);
-                next_y += share * (get(next + area + s) - qy);
+                at += frame;
+                x1 += missing(at, share, qx);
+                y1 += missing(at + area, share, qy);
+            }
+            if (together > 2) {
+                at += frame;
+                x2 += missing(at, share, qx);
+                y2 += missing(at + area, share, qy);
+                at += frame;
+                x3 += missing(at, share, qx);
+                y3 += missing(at + area, share, qy);
             }
         }
         const float16 share = get(shares + i);
-        put(residual + i, share * x);
-        put(residual + nodes + i, share * y);
+        put(residual + i, share * x0);
+        put(residual + nodes + i, share * y0);
         if (together > 1) {
-            put(residual + 2 * nodes + i, share * next_x);
-            put(residual + 3 * nodes + i, share * next_y);
+            put(residual + 2 * nodes + i, share * x1);
+            put(residual + 3 * nodes + i, share * y1);
+        }
+        if (together > 2) {
+            put(residual + 4 * nodes + i, share * x2);
+            put(residual + 5 * nodes + i, share * y2);
+            put(residual + 6 * nodes + i, share * x3);
+            put(residual + 7 * nodes + i, share * y3);
         }
     }
     for (int plane = 0; plane < 2 * together; ++plane) {

@@ -35,6 +35,12 @@ def given(share: vec16, lanes: int):
 
 
 @wp.func
+def missing(field: wp.array[float], at: int, share: vec16, q: vec16):
+    """A share of the flow that is missing at a pixel, in one direction and frame."""
+    return wp.cw_mul(share, get(field, at) - q)
+
+
+@wp.func
 def orient(
     m: int,
     own: wp.array[float],
@@ -55,32 +61,51 @@ def orient(
     residual: wp.array[float],
     here: int,
 ):
-    """The flow that is missing to prototype `m`, for each of its pixels, in one frame or two."""
+    """The flow that is missing to prototype `m`, for each of its pixels, in 1, 2 or 4 frames."""
     vectors = area / LANES
-    next = there + 2 * (area + LANES)
+    frame = 2 * (area + LANES)
     for v in range(vectors):
         i = LANES * v
-        x = vec16()
-        y = vec16()
-        next_x = vec16()
-        next_y = vec16()
+        x0 = vec16()
+        y0 = vec16()
+        x1 = vec16()
+        y1 = vec16()
+        x2 = vec16()
+        y2 = vec16()
+        x3 = vec16()
+        y3 = vec16()
         for k in range(firsts[m * vectors + v], firsts[m * vectors + v + 1]):
             part = neighbours[k]
             s = i + part[1] * pitch + part[0]
             qx = get(own, LANES + 2 * m * area + s)
             qy = get(own, LANES + (2 * m + 1) * area + s)
             share = given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
-            x += wp.cw_mul(share, get(field, there + s) - qx)
-            y += wp.cw_mul(share, get(field, there + area + s) - qy)
+            at = there + s
+            x0 += missing(field, at, share, qx)
+            y0 += missing(field, at + area, share, qy)
             if together > 1:
-                next_x += wp.cw_mul(share, get(field, next + s) - qx)
-                next_y += wp.cw_mul(share, get(field, next + area + s) - qy)
+                at += frame
+                x1 += missing(field, at, share, qx)
+                y1 += missing(field, at + area, share, qy)
+            if together > 2:
+                at += frame
+                x2 += missing(field, at, share, qx)
+                y2 += missing(field, at + area, share, qy)
+                at += frame
+                x3 += missing(field, at, share, qx)
+                y3 += missing(field, at + area, share, qy)
         share = get(shares, m * area + i)
-        put(residual, here + i, wp.cw_mul(share, x))
-        put(residual, here + nodes + i, wp.cw_mul(share, y))
+        to = here + i
+        put(residual, to, wp.cw_mul(share, x0))
+        put(residual, to + nodes, wp.cw_mul(share, y0))
         if together > 1:
-            put(residual, here + 2 * nodes + i, wp.cw_mul(share, next_x))
-            put(residual, here + 3 * nodes + i, wp.cw_mul(share, next_y))
+            put(residual, to + 2 * nodes, wp.cw_mul(share, x1))
+            put(residual, to + 3 * nodes, wp.cw_mul(share, y1))
+        if together > 2:
+            put(residual, to + 4 * nodes, wp.cw_mul(share, x2))
+            put(residual, to + 5 * nodes, wp.cw_mul(share, y2))
+            put(residual, to + 6 * nodes, wp.cw_mul(share, x3))
+            put(residual, to + 7 * nodes, wp.cw_mul(share, y3))
     for plane in range(2 * together):
         at = here + plane * nodes
         for row in range(rows[m], rows[m + 1]):

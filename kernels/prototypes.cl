@@ -1,9 +1,9 @@
 /* Prototypes moved along flows of the model and mixed: CE05, Eq. 2 in one launch.
  *
- * A worker takes one prototype after the other of a group of one mixture or two: the flow that is
- * missing to it is carried to its pixels (orientation), for both at once, and these along that flow into
- * sums that belong to the worker alone (rings). Flows are planes, one a direction, with rows padded to whole vectors; a padded row is a
- * pitch.
+ * A worker takes one prototype after the other of a group of up to four mixtures: the flow that is
+ * missing to it is carried to its pixels (orientation), for all at once, and these along that flow into
+ * sums that belong to the worker alone (rings). Flows are planes, one a direction, with rows padded to
+ * whole vectors; a padded row is a pitch.
  */
 
 #include "lanes.cl"
@@ -31,7 +31,7 @@ __kernel void mix_prototypes(
     __global const float *scale,       /* (H, pitch) of what is written; 0 where nothing is asked */
     const int frames,
     const int mixtures,
-    const int together,                /* mixtures of a group: 1 or 2 */
+    const int together,                /* mixtures of a group: 1, 2 or 4 */
     const int height,
     const int width,
     const int size,                    /* of a pyramid without its finest level */

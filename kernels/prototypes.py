@@ -1,7 +1,7 @@
 """Prototypes moved along flows of the model and mixed: CE05, Eq. 2 in one launch.
 
-A worker takes one prototype after the other of a group of one mixture or two: the flow that is
-missing to it is carried to its pixels (orientation), for both at once, and these along that flow
+A worker takes one prototype after the other of a group of up to four mixtures: the flow that is
+missing to it is carried to its pixels (orientation), for all at once, and these along that flow
 into sums that belong to the worker alone (rings). Flows are planes, one a direction, with rows
 padded to whole vectors; a padded row is a pitch.
 """
@@ -43,7 +43,7 @@ def mix_prototypes(
     scale: wp.array[float],  # (H, pitch) of what is written; 0 where nothing is asked for
     frames: int,
     mixtures: int,
-    together: int,  # mixtures of a group: 1 or 2
+    together: int,  # mixtures of a group: 1, 2 or 4
     height: int,
     width: int,
     size: int,  # of a pyramid without its finest level

@@ -34,7 +34,7 @@ class Synthesizer:
     """What synthesis needs of a basis, computed once.
 
     kernels, held: the backend, and the prototypes on it.
-    flows: of the prototypes but the reference, as planes, (M - 1, 2, h, pitch) [px].
+    flows: on the device: of the prototypes but the reference, planes (M - 1, 2, h, pitch) [px].
     scale: on the device: 1 where a picture is made, else 0, (h, pitch).
     inside: the rectangle with all of that, in the region.
     outside: the reference prototype where no picture is made, else 0, (h, w, 3).
@@ -42,7 +42,7 @@ class Synthesizer:
 
     kernels: Backend
     held: Any
-    flows: F32
+    flows: Any
     scale: Any
     inside: tuple[slice, slice]
     outside: F32
@@ -69,7 +69,7 @@ def prepare_synthesis(
     return Synthesizer(
         kernels=kernels,
         held=kernels.hold_prototypes(part.images, part.flows, HOLE),
-        flows=planes(part.flows[part.moving]),
+        flows=kernels.to_device(planes(part.flows[part.moving])),
         scale=kernels.to_device(scale),
         inside=inside,
         outside=np.where(shown[..., None], 0, basis.images[basis.reference]),
@@ -106,8 +106,8 @@ def synthesize_batch(synthesizer: Synthesizer, alpha: Floats, beta: Floats) -> F
     s, k = synthesizer, synthesizer.kernels
     weights = np.where(beta > NO_TEXTURE, beta, 0)
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-    flows = np.tensordot(alpha.astype(np.float32), s.flows, axes=1)
-    mixed = k.mix_prototypes(s.held, k.to_device(flows), k.to_device(weights), s.scale)
+    flows = k.blend(s.flows, k.to_device(alpha.astype(np.float32)))
+    mixed = k.mix_prototypes(s.held, flows, k.to_device(weights), s.scale)
     made = np.tile(s.outside, (len(alpha), 1, 1, 1))
     for image, one in zip(made, k.to_host(mixed), strict=True):
         part = image[s.inside]

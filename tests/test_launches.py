@@ -1,5 +1,7 @@
 """What every runtime makes of moved and mixed prototypes, against the reference."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -37,8 +39,11 @@ def moved(name, images, flows, flow, used, scale, threads=None):
     return np.moveaxis(made[..., : images.shape[2]], 1, -1)
 
 
-def mixed(name, images, flows, wanted, weights, scale, threads=None):
-    k = get_backend(name, threads)
+def mixed(name, *given, threads=None):
+    return mix(get_backend(name, threads), *given)
+
+
+def mix(k, images, flows, wanted, weights, scale):
     held = k.hold_prototypes(images, flows, HOLE)
     given = planes(wanted), np.float32(weights), planes(scale[..., None])[0]
     made = k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
@@ -72,6 +77,19 @@ def test_mixed_prototypes(backend, own, size):
     given = images, flows, wanted, weights, some_of(size, rng)
     desired = mixed("numpy", *given)
     assert_allclose(mixed(backend, *given), desired, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("mixtures", [1, 2, 3, 4, 5, 7, 8])
+def test_mixtures_whose_flows_are_oriented_together_are_as_alone(backend, mixtures):
+    k, size = replace(get_backend(backend), workers=1), (9, 20)
+    images, flows = prototypes("tearing", size)
+    rng = np.random.default_rng(8)
+    weights, scale = rng.dirichlet(np.ones(NUMBER), mixtures), some_of(size, rng)
+    wanted = rng.normal(0, 2, (mixtures, *size, 2)).astype(np.float32)
+    made = mix(k, images, flows, wanted, weights, scale)
+    for b in range(mixtures):
+        alone = mix(k, images, flows, wanted[b : b + 1], weights[b : b + 1], scale)
+        assert_array_equal(made[b], alone[0])
 
 
 @pytest.mark.parametrize("kind", ["mirrored", "down", "up and down"])

@@ -24,6 +24,7 @@ COLOURS = 3  # channels of a picture, as in kernels/sample
 RUN = 16  # points of a thread, as in kernels/sample
 WHITE = 65535  # of a texture, as in kernels/prototypes
 MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
+TOGETHER = 4, 2, 1  # mixtures whose flows are re-oriented at once: as many as there are enough of
 TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
 
 
@@ -193,7 +194,7 @@ class Launches(ABC):
     def mix_prototypes(self, held: Prototypes, flows: Any, weights: Any, scale: Any) -> Any:
         shares = self.to_host(weights)
         mixtures, number = shares.shape
-        together = 2 if mixtures >= 2 * self.workers else 1
+        together = next(n for n in TOGETHER if n == 1 or mixtures >= n * self.workers)
         groups = math.ceil(mixtures / together)
         padded = np.zeros((groups, together, number), np.float32)
         padded.reshape(-1, number)[:mixtures] = shares
