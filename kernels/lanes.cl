@@ -4,6 +4,10 @@
  * Operators and clang's own functions alone: PoCL calls its functions of 16 lanes, and inlines none.
  */
 
+#ifndef __has_builtin
+#define __has_builtin(name) 0
+#endif
+
 #define FAR 1.0e8f /* [px] beyond any picture, inside int */
 #define HUGE 1.0e30f
 #define LANES 16
