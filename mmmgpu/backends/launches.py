@@ -24,7 +24,7 @@ COLOURS = 3  # channels of a picture, as in kernels/sample
 RUN = 16  # points of a thread, as in kernels/sample
 WHITE = 65535  # of a texture, as in kernels/prototypes
 MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
-TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
+TILE = 64  # corpus rows packed at a time
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,12 @@ class Launches(ABC):
     def _packed(self, fields: Any, points: int, channels: int, first: int, count: int) -> Any:
         """Rows of `fields` (N, P, C) as padded planes, shape (count, C, V * 16)."""
         planes = self.empty(count, channels, math.ceil(points / LANES) * LANES)
-        self.launch("distance_scan.pack", first, count, [fields, points, channels], [planes])
+        whole = points - points % LANES if channels == 2 else 0
+        if whole:
+            self.launch("distance_scan.pack_flows", first, count, [fields, points], [planes])
+        if whole < points:
+            rest = [fields, points, channels, whole]
+            self.launch("distance_scan.pack", first, count, rest, [planes])
         return planes
 
 
