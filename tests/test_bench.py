@@ -70,7 +70,7 @@ def test_bytes_are_those_of_the_arguments_and_the_answer(make):
         partial(matching_work, OURS, prototypes=4, frames=6, side=32),
         partial(trajectory_work, ["scipy"], seconds=1),
         partial(gdlr_work, seconds=1),
-        partial(training_work, seconds=2, dimensions=1),
+        partial(training_work, seconds=2, dimensions=2, checked=1),
     ],
     ids=lambda work: work.func.__name__,
 )
