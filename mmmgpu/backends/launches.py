@@ -75,10 +75,10 @@ class Launches(ABC):
         """Copy the items `first` ... `first + count - 1` of the first axis."""
 
     @abstractmethod
-    def launch(
-        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
-    ) -> None:
-        """Run ``stem.name`` for the items `first` ... `first + count - 1`.
+    def launcher(
+        self, kernel: str, inputs: list[Any], outputs: list[Any]
+    ) -> Callable[[int, int], None]:
+        """What runs ``stem.name`` for the items `first` ... `first + count - 1`, given these two.
 
         The kernel's arguments are `inputs`, first, count and `outputs`.
         """
@@ -87,9 +87,16 @@ class Launches(ABC):
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         """Call `work(first, n)` for contiguous parts of `count` items, on all threads."""
 
+    def launch(
+        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
+    ) -> None:
+        """Run a kernel for the items `first` ... `first + count - 1`."""
+        self.launcher(kernel, inputs, outputs)(first, count)
+
     def launch_all(self, kernel: str, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Run a kernel for the items 0 ... `count` - 1 on all threads."""
-        self.split(count, lambda first, n: self.launch(kernel, first, n, inputs, outputs))
+        if count:
+            self.split(count, self.launcher(kernel, inputs, outputs))
 
     def forward_warp(self, field: Any, flow: Any) -> tuple[Any, Any]:
         fields, height, width, channels = field.shape

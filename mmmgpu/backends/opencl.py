@@ -181,14 +181,21 @@ class OpenCL(Launches):
         with _faults_of(self.name):
             cl.enqueue_copy(self.queue, target.data, source.data, **span)
 
-    def launch(
-        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
-    ) -> None:
-        local = LOCAL if count >= LOCAL * GROUPS * self.queue.device.max_compute_units else 1
-        padded = -(-count // local) * local
-        arguments = [_argument(a) for a in (*inputs, first, count, *outputs)]
-        with _launching, _faults_of(self.name):
-            _kernel(self.queue.context, kernel)(self.queue, (padded,), (local,), *arguments)
+    def launcher(
+        self, kernel: str, inputs: list[Any], outputs: list[Any]
+    ) -> Callable[[int, int], None]:
+        compiled = _kernel(self.queue.context, kernel)
+        many = LOCAL * GROUPS * self.queue.device.max_compute_units
+        before, after = [_argument(a) for a in inputs], [_argument(a) for a in outputs]
+
+        def launch(first: int, count: int) -> None:
+            local = LOCAL if count >= many else 1
+            padded = -(-count // local) * local
+            given = [*before, np.int32(first), np.int32(count), *after]
+            with _launching, _faults_of(self.name):
+                compiled(self.queue, (padded,), (local,), *given)
+
+        return launch
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         """The driver has the threads. Wait for it: the memory of an input may be NumPy's."""
