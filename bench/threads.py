@@ -25,7 +25,7 @@ PARALLEL = (*COMPUTE_BOUND, "blend", "sample")
 MACHINE = {"copy": lambda: copy_of(2 * COPIED, default_threads()), "product": product}
 
 
-def measure_threads(backends, *, works=PARALLEL, turns=15):
+def measure_threads(backends, *, works=PARALLEL, turns=9):
     """How many times faster each number of threads is than one, in all works and plain loops."""
     counts = up_to(default_threads())
     names = [*MACHINE, *(f"{key}, {name}" for key in works for name in backends)]

@@ -15,7 +15,7 @@ from mmmgpu.errors import InputError
 
 REFERENCE = "reference"
 COPY = "copy"  # of as many bytes
-PAUSE = 0.03  # s
+PAUSE = 0.15  # s: OpenBLAS's threads spin for 0.13 s after they have worked
 LEAST = 0.01  # s: what takes less is repeated within its turn
 SLOW = 1.0  # s: what takes longer has one turn only
 
@@ -62,7 +62,7 @@ class Work:
 class Effort:
     """How long to measure: at least `turns` of all contenders, then until `seconds` are over."""
 
-    turns: int = 5
+    turns: int = 7
     seconds: float = 2.0
     most: int = 25
 
