@@ -20,9 +20,7 @@ from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 from mmmgpu.voices import is_installed
 
-VERSION = (
-    3  # of the record; 2: ran while OpenBLAS's threads still spun; 1: did not repeat short runs
-)
+VERSION = 3  # of the record; 2: no pause for OpenBLAS's threads; 1: short runs were not repeated
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
 
 
