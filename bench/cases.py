@@ -66,10 +66,20 @@ def fill(rng, batch=46, height=160, width=192):
 
 
 def blend(rng, number=46, height=160, width=192):
-    """One weighted sum."""
-    images = rng.random((number, height, width, 3), dtype=np.float32)
+    """One weighted sum of mouths."""
+    return mixture(rng, number, height, width, channels=3)
+
+
+def blend_large(rng, number=50, height=256, width=256):
+    """One weighted sum of arrays of the size that `splat` works on."""
+    return mixture(rng, number, height, width, channels=4)
+
+
+def mixture(rng, number, height, width, channels):
+    """`blend` with one row of weights."""
+    images = rng.random((number, height, width, channels), dtype=np.float32)
     weights = rng.dirichlet(np.ones(number), 1).astype(np.float32)
-    name, size = f"blend {number}x{height}x{width}x3", 3 * height * width
+    name, size = f"blend {number}x{height}x{width}x{channels}", channels * height * width
     return Case(name, "blend", (images, weights), size, 2 * number * size)
 
 
@@ -146,4 +156,4 @@ def piecewise(rng, height=288, width=360, batch=16, across=8):
     )
 
 
-CASES = (splat, fill, blend, sample, sample_at_random, scan, rbf, piecewise)
+CASES = (splat, fill, blend, blend_large, sample, sample_at_random, scan, rbf, piecewise)

@@ -10,7 +10,7 @@ def draw_growth(growth, threads, path):
     """Side by side, in logarithms: one chart for each axis of growth, and one of threads.
 
     Args:
-        growth, threads: As of `bench.growth.measure_growth` and `measure_threads`.
+        growth, threads: As of `bench.growth.measure_growth` and `bench.threads.measure_threads`.
         path: An .svg.
     """
     import matplotlib as mpl

@@ -1,13 +1,17 @@
-"""The operations one by one, on device arrays, beside the same work by other libraries."""
+"""The operations one by one, on device arrays, beside the same work by other libraries.
+
+A plain copy that reads and writes as many bytes takes turns with them: one pass over the bytes.
+"""
 
 from functools import partial
 
 import numpy as np
 
-from mmmgpu.backends import get_backend
+from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.bench.cases import CASES
+from mmmgpu.bench.machine import copy_of
 from mmmgpu.bench.peers import find_peers
-from mmmgpu.bench.timing import Contender, Work
+from mmmgpu.bench.timing import COPY, Contender, Work
 
 EQUAL = 1e-5  # of the scale of an output: the contract of docs/kernels.md
 
@@ -30,6 +34,7 @@ def kernel_work(make, backends, peers):
         case.name,
         lambda: getattr(k, case.operation)(part, *others, *case.scalars),
         contenders,
+        beside={COPY: copy_of(case.bytes, default_threads())},
         bytes=case.bytes,
         operations=case.operations,
         part=len(part) / len(first),

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 from mmmgpu.backends import get_backend
 from mmmgpu.bench.endurance import measure_endurance
-from mmmgpu.bench.growth import measure_growth, measure_threads
+from mmmgpu.bench.growth import measure_growth
 from mmmgpu.bench.kernels import kernel_works
 from mmmgpu.bench.machine import describe_machine, measure_machine
 from mmmgpu.bench.models import model_works
@@ -14,12 +14,13 @@ from mmmgpu.bench.pictures import picture_works
 from mmmgpu.bench.pipeline import measure_pipeline
 from mmmgpu.bench.startup import measure_startup
 from mmmgpu.bench.targets import judge_targets
+from mmmgpu.bench.threads import measure_threads
 from mmmgpu.bench.timing import QUICK, Effort, measure
 from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 from mmmgpu.voices import is_installed
 
-VERSION = 2  # of the record; 1: short runs were not repeated
+VERSION = 3  # of the record; 2: no pause for OpenBLAS's threads; 1: short runs were not repeated
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
 
 
@@ -67,7 +68,7 @@ def run_benchmarks(plan):
     }
     if "growth" in parts:
         results["growth"] = measure_growth(plan.backends)
-        results["threads"] = measure_threads(plan.backends, rounds=1 if plan.quick else 2)
+        results["threads"] = measure_threads(plan.backends, turns=3 if plan.quick else 9)
     if "startup" in parts:
         results["startup"] = measure_startup(plan.backends)
     if "pipeline" in parts and is_installed():

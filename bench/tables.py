@@ -1,6 +1,6 @@
 """The results of a run as rows of tables, losses included."""
 
-from mmmgpu.bench.timing import REFERENCE
+from mmmgpu.bench.timing import COPY, REFERENCE
 
 WORKS = f"{'':32}  median ms          quartiles   cpu ms  x ref  x peer    bytes    flops"
 WORKS += "    first transfer  differs"
@@ -39,7 +39,7 @@ def line(who, row, slow, best, work):
 
 def is_peer(who):
     """Whether a contender is another library."""
-    return who != REFERENCE and who.partition(":")[0] not in OURS
+    return who not in (REFERENCE, COPY) and who.partition(":")[0] not in OURS
 
 
 def percent(share):

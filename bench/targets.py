@@ -5,7 +5,7 @@ Each is judged by the best backend, with the medians of the run.
 
 from dataclasses import dataclass
 
-from mmmgpu.bench.timing import REFERENCE
+from mmmgpu.bench.timing import COPY, REFERENCE
 
 BACKENDS = ("warp", "opencl")
 
@@ -52,14 +52,11 @@ def per_second(key):
 
 
 def of_one_pass(key):
-    """The time of the best of ours in those of a pass over the bytes at copy bandwidth."""
+    """The time of the best of ours in those of a copy of as many bytes, in the same turns."""
 
     def value(results):
-        ours = median(results, key, *BACKENDS)
-        if not ours:
-            return None
-        once = results["works"][key]["bytes"] / results["machine"]["copy_gb_per_s"] / 1e6
-        return ours / once
+        ours, once = median(results, key, *BACKENDS), median(results, key, COPY)
+        return ours / once if ours and once else None
 
     return value
 
@@ -87,6 +84,16 @@ def gain(key):
     return value
 
 
+def gain_beside_copy(key):
+    """What all threads gain over one, as a share of what a plain copy gains, the best backend."""
+
+    def value(results):
+        ours, copy = gain(key)(results), results.get("threads", {}).get("gain", {}).get(COPY)
+        return ours / copy[-1] if ours and copy else None
+
+    return value
+
+
 def slowest_start(results):
     """Seconds to the first frame with a full cache, of the slower backend."""
     return max((s["full_cache_s"] for s in results.get("startup", {}).values()), default=None)
@@ -97,6 +104,7 @@ TARGETS = (
     Target("distance_scan over numba", 1.5, faster_than("scan", "numba")),
     Target("sample over OpenCV remap", 0.8, faster_than("sample", "opencv")),
     Target("blend, passes over its bytes", 1.3, of_one_pass("blend"), most=True),
+    Target("blend 50x256x256x4, passes", 1.3, of_one_pass("blend_large"), most=True),
     Target("dense RBF over NumPy", 3, faster_than("rbf", "numpy peer")),
     Target("synthesis [frames/s]", 60, per_second("synthesis")),
     Target("synthesis over the reference", 20, faster_than("synthesis", REFERENCE)),
@@ -110,6 +118,8 @@ TARGETS = (
     Target("threads, forward_warp", 1.7, gain("splat")),
     Target("threads, distance_scan", 1.7, gain("scan")),
     Target("threads, dense RBF", 1.7, gain("rbf")),
+    Target("threads, blend, of a copy's gain", 0.9, gain_beside_copy("blend")),
+    Target("threads, sample, of a copy's gain", 0.9, gain_beside_copy("sample")),
     Target("first frame, full cache [s]", 1, slowest_start, most=True),
 )
 

@@ -6,7 +6,7 @@ transfer and compute are apart. What is reported is the median, with quartiles a
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ import numpy as np
 from mmmgpu.errors import InputError
 
 REFERENCE = "reference"
-PAUSE = 0.03  # s
+COPY = "copy"  # of as many bytes
+PAUSE = 0.15  # s: OpenBLAS's threads spin for 0.13 s after they have worked
 LEAST = 0.01  # s: what takes less is repeated within its turn
 SLOW = 1.0  # s: what takes longer has one turn only
 
@@ -40,6 +41,7 @@ class Work:
 
     reference: computes the answer slowly, or the first part of it.
     contenders: by name.
+    beside: other work that takes turns with the contenders, to compare them with.
     bytes, operations: that it takes at least, for the roofline; None where they are not counted.
     items: how many things are done in one run, of the kind `unit`.
     part: the share of the work that the reference does.
@@ -48,6 +50,7 @@ class Work:
     name: str
     reference: Callable[[], Any]
     contenders: Mapping[str, Contender]
+    beside: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     bytes: float | None = None
     operations: float | None = None
     items: int = 1
@@ -59,7 +62,7 @@ class Work:
 class Effort:
     """How long to measure: at least `turns` of all contenders, then until `seconds` are over."""
 
-    turns: int = 5
+    turns: int = 7
     seconds: float = 2.0
     most: int = 25
 
@@ -80,8 +83,8 @@ def measure(work, effort):
     runs, found = {}, {}
     for name, contender in work.contenders.items():
         runs[name], found[name] = validated(work.name, name, contender, desired)
-    seconds = take_turns(runs, effort)
-    rows = {name: statistics(*s) | found[name] for name, s in seconds.items()}
+    seconds = take_turns(runs | work.beside, effort)
+    rows = {name: statistics(*s) | found.get(name, {}) for name, s in seconds.items()}
     rows[REFERENCE] = statistics(np.array([slow]), np.array([processor]))
     size = {"bytes": work.bytes, "operations": work.operations}
     return {"items": work.items, "unit": work.unit, **size, "contenders": rows}

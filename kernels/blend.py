@@ -32,14 +32,16 @@ def blend(
     b = (first + tid) / vectors
     v = (first + tid) % vectors
     total = vec16d()
-    for begin in range(0, number, BLOCK):
+    whole = number - number % BLOCK
+    for begin in range(0, whole, BLOCK):
         part = vec16()
-        for j in range(BLOCK):
-            m = wp.min(begin + j, number - 1)
-            w = wp.where(begin + j < number, weights[b * number + m], 0.0)
-            part += w * images[m, v]
+        for m in range(BLOCK):
+            part += weights[b * number + begin + m] * images[begin + m, v]
         total += vec16d(part)
-    blended[b, v] = vec16(total)
+    rest = vec16()
+    for m in range(whole, number):
+        rest += weights[b * number + m] * images[m, v]
+    blended[b, v] = vec16(total + vec16d(rest))
 
 
 @wp.kernel

@@ -9,15 +9,17 @@
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
 #define LANES 16
-#define MAGIC 0x5f1ffff9
-#define STEP 1.6819147f
-#define SHARE 0.70395297f
+#define MAGIC 0x5f200000
 #define BLOCK 16 /* vectors summed in float */
+
+/* 16 flows anywhere. */
+typedef float float32u __attribute__((ext_vector_type(32), aligned(4)));
 
 __kernel void pack(
     __global const float *fields,    /* (N, P, C) */
     const int points,                /* P */
     const int channels,
+    const int begin,                 /* the points before it are packed already */
     const int first,
     const int count,
     /* outputs */
@@ -30,20 +32,40 @@ __kernel void pack(
     const int source = (first + tid) * points * channels;
     for (int c = 0; c < channels; ++c) {
         const int target = (tid * channels + c) * padded;
-        for (int p = 0; p < points; ++p)
+        for (int p = begin; p < points; ++p)
             planes[target + p] = fields[source + p * channels + c];
         for (int p = points; p < padded; ++p)
             planes[target + p] = 0.0f;
     }
 }
 
-/* sqrt(x), within 4e-7 of it: 1/sqrt(x) by its bits and two Newton steps, times x. */
+__kernel void pack_flows(
+    __global const float *restrict flows, /* (N, P, 2) */
+    const int points,                     /* P */
+    const int first,
+    const int count,
+    /* outputs */
+    __global float16 *restrict planes)    /* (count, 2, V, 16), whole vectors of points are written */
+{
+    const int tid = get_global_id(0);
+    if (tid >= count)
+        return;
+    const int vectors = (points + LANES - 1) / LANES;
+    const int target = 2 * tid * vectors;
+    for (int v = 0; v < points / LANES; ++v) {
+        const float32u flow = *(__global const float32u *)(flows + 2 * ((first + tid) * points + v * LANES));
+        planes[target + v] = flow.even;
+        planes[target + vectors + v] = flow.odd;
+    }
+}
+
+/* sqrt(x), within 8e-7 of it: xy / sqrt(xyy), where y is 1/sqrt(x) by its bits, 0.75 < xyy < 0.844. */
 float16 root(const float16 x)
 {
-    float16 y = as_float16(MAGIC - (as_int16(x) >> 1));
-    y *= STEP - SHARE * (x * y * y);
+    const float16 y = as_float16(MAGIC - (as_int16(x) >> 1));
     const float16 xy = x * y;
-    return xy * (1.5f - 0.5f * (xy * y));
+    const float16 t = xy * y;
+    return xy * (2.45213665f + t * (-3.07998830f + t * (2.31981536f + t * -0.692957570f)));
 }
 
 double sum(const float16 part)

@@ -12,6 +12,7 @@ wp.set_module_options({"enable_backward": False})
 LANES = 16
 BLOCK = wp.constant(16)  # vectors summed in float32
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
+vec32 = wp.types.vector(length=2 * LANES, dtype=wp.float32)
 
 
 @wp.kernel
@@ -19,6 +20,7 @@ def pack(
     fields: wp.array[float],  # (N, P, C)
     points: int,  # P
     channels: int,
+    begin: int,  # the points before it are packed already
     first: int,
     count: int,
     # outputs
@@ -31,10 +33,35 @@ def pack(
     source = (first + tid) * points * channels
     for c in range(channels):
         target = (tid * channels + c) * padded
-        for p in range(points):
+        for p in range(begin, points):
             planes[target + p] = fields[source + p * channels + c]
         for p in range(points, padded):
             planes[target + p] = 0.0
+
+
+@wp.kernel
+def pack_flows(
+    flows: wp.array2d[vec32],  # (N, P, 2) as rows of P // 16 whole vectors
+    points: int,  # P
+    first: int,
+    count: int,
+    # outputs
+    planes: wp.array[vec16],  # (count, 2, V), whole vectors of points are written
+):
+    tid = wp.tid()
+    if tid >= count:
+        return
+    vectors = (points + LANES - 1) / LANES
+    target = 2 * tid * vectors
+    for v in range(points / LANES):
+        flow = flows[first + tid, v]
+        x = vec16()
+        y = vec16()
+        for lane in range(LANES):
+            x[lane] = flow[2 * lane]
+            y[lane] = flow[2 * lane + 1]
+        planes[target + v] = x
+        planes[target + vectors + v] = y
 
 
 @wp.func

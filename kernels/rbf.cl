@@ -10,23 +10,22 @@
 #define LANES 16
 #define WIDE 8
 #define FAR 3.0e38f   /* squares beyond float stay finite: 0 times them is 0 */
-#define LEAST -87.0f /* exp of it is nothing, but no denormal number */
+#define LEAST -126.0f /* 2 to it is nothing, but no denormal number */
 #define ROUND 12582912.0f /* 1.5 2^23: added to a number, it leaves the nearest whole one */
+#define LOG2_E 1.44269504f
 
-/* exp(x) for x <= 0, within 2e-7 of it: 2^n exp(r), |r| <= ln 2 / 2 (Cephes, expf). */
+/* 2^x for x <= 0, within 2e-7 of it: 2^n 2^r, |r| <= 1/2, the best polynomial with 2^0 = 1. */
 float8 decay(const float8 x)
 {
     const float8 within = x > LEAST ? x : LEAST;
-    const float8 shifted = within * 1.44269504f + ROUND;
-    const float8 n = shifted - ROUND;
-    const float8 r = within - n * 0.693359375f + n * 2.12194440e-4f;
-    float8 p = 1.9875691e-4f * r + 1.3981999e-3f;
-    p = p * r + 8.3334519e-3f;
-    p = p * r + 4.1665796e-2f;
-    p = p * r + 1.6666667e-1f;
-    p = p * r + 0.5f;
-    p = p * r * r + r + 1.0f;
-    return as_float8(as_int8(p) + ((as_int8(shifted) - as_int((float)ROUND)) << 23));
+    const float8 shifted = within + ROUND;
+    const float8 r = within - (shifted - ROUND);
+    float8 p = 1.3264726e-3f * r + 9.6715130e-3f;
+    p = p * r + 5.5507336e-2f;
+    p = p * r + 2.4022242e-1f;
+    p = p * r + 6.9314700e-1f;
+    p = p * r + 1.0f;
+    return as_float8(as_int8(p) + (as_int8(shifted) << 23)); /* what ROUND adds is shifted out */
 }
 
 double4 wide(const float4 x)
@@ -67,11 +66,12 @@ __kernel void evaluate_rbf(
             u[side] = (double)affine[0] + (double)affine[1] * wx + (double)affine[2] * wy;
             v[side] = (double)affine[3] + (double)affine[4] * wx + (double)affine[5] * wy;
         }
+        const float falling = -LOG2_E * sharpness;
         for (int k = 0; k < terms; ++k) {
             const float8 dx = x - centres[2 * k];
             const float8 dy = y - centres[2 * k + 1];
             const float8 square = dx * dx + dy * dy;
-            const float8 phi = decay(-sharpness * (square < FAR ? square : FAR));
+            const float8 phi = decay(falling * (square < FAR ? square : FAR));
             u[0] += (double)weights[2 * k] * wide(phi.lo);
             u[1] += (double)weights[2 * k] * wide(phi.hi);
             v[0] += (double)weights[2 * k + 1] * wide(phi.lo);

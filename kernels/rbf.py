@@ -12,8 +12,9 @@ wp.set_module_options({"enable_backward": False})
 LANES = 16
 BLOCK = 8
 FAR = wp.constant(3.0e38)  # squares beyond float32 stay finite: 0 times them is 0
-LEAST = wp.constant(-87.0)  # exp of it is nothing, but no denormal number
+LEAST = wp.constant(-126.0)  # 2 to it is nothing, but no denormal number
 ROUND = wp.constant(12582912.0)  # 1.5 2^23: added to a number, it leaves the nearest whole one
+LOG2_E = wp.constant(1.44269504)
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16d = wp.types.vector(length=LANES, dtype=wp.float64)
 vec16i = wp.types.vector(length=LANES, dtype=wp.int32)
@@ -22,19 +23,17 @@ block16 = wp.types.matrix(shape=(BLOCK, LANES), dtype=wp.float32)
 
 @wp.func
 def decay(x: vec16):
-    """exp(x) for x <= 0, within 2e-7 of it: 2^n exp(r), |r| <= ln 2 / 2 (Cephes, expf)."""
+    """2^x for x <= 0, within 2e-7 of it: 2^n 2^r, |r| <= 1/2, the best polynomial with 2^0 = 1."""
     within = wp.max(x, vec16(LEAST))
-    shifted = within * 1.44269504 + vec16(ROUND)
-    n = shifted - vec16(ROUND)
-    r = within - n * 0.693359375 + n * 2.12194440e-4
-    p = 1.9875691e-4 * r + vec16(1.3981999e-3)
-    p = wp.cw_mul(p, r) + vec16(8.3334519e-3)
-    p = wp.cw_mul(p, r) + vec16(4.1665796e-2)
-    p = wp.cw_mul(p, r) + vec16(1.6666667e-1)
-    p = wp.cw_mul(p, r) + vec16(0.5)
-    p = wp.cw_mul(wp.cw_mul(p, r), r) + r + vec16(1.0)
-    power = wp.cast(shifted, vec16i) - wp.cast(vec16(ROUND), vec16i)
-    return wp.cast(wp.cast(p, vec16i) + power * 8388608, vec16)
+    shifted = within + vec16(ROUND)
+    r = within - (shifted - vec16(ROUND))
+    p = 1.3264726e-3 * r + vec16(9.6715130e-3)
+    p = wp.cw_mul(p, r) + vec16(5.5507336e-2)
+    p = wp.cw_mul(p, r) + vec16(2.4022242e-1)
+    p = wp.cw_mul(p, r) + vec16(6.9314700e-1)
+    p = wp.cw_mul(p, r) + vec16(1.0)
+    power = wp.cast(shifted, vec16i) * 8388608  # 2^23: what ROUND adds is shifted out
+    return wp.cast(wp.cast(p, vec16i) + power, vec16)
 
 
 @wp.kernel
@@ -65,6 +64,7 @@ def evaluate_rbf(
     u += wp.float64(affine[1]) * vec16d(x) + wp.float64(affine[2]) * vec16d(y)
     v = vec16d(wp.float64(affine[3]))
     v += wp.float64(affine[4]) * vec16d(x) + wp.float64(affine[5]) * vec16d(y)
+    falling = -LOG2_E * sharpness
     phi = block16()
     for begin in range(0, terms, BLOCK):
         some = wp.min(BLOCK, terms - begin)
@@ -72,7 +72,7 @@ def evaluate_rbf(
             dx = x - vec16(centres[2 * (begin + i)])
             dy = y - vec16(centres[2 * (begin + i) + 1])
             square = wp.min(wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy), vec16(FAR))
-            phi[i] = decay(-sharpness * square)
+            phi[i] = decay(falling * square)
         for i in range(some):
             wide = vec16d(phi[i])
             u += wp.float64(weights[2 * (begin + i)]) * wide

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu import backends
-from mmmgpu.backends import BACKENDS, default_threads, get_backend
+from mmmgpu.backends import BACKENDS, default_threads, get_backend, opencl
 from mmmgpu.errors import InputError
 
 EVERYTHING = """
@@ -121,6 +121,33 @@ def test_the_opencl_driver_obeys_too(variable):
     get_backend("opencl")  # whose driver has read its environment: a child must not inherit that
     program = "from mmmgpu.backends import get_backend; print(get_backend('opencl').workers)"
     assert run(program, **{variable: "1"}) == "1\n"
+
+
+@pytest.mark.parametrize(
+    ("cores", "of", "threads", "pinned"),
+    [({0, 1}, 2, 2, True), ({0, 1}, 2, 1, False), ({1, 2}, 2, 2, False), ({0, 1}, 4, 2, False)],
+)
+def test_threads_of_opencl_are_pinned_where_they_have_the_whole_machine(
+    monkeypatch, cores, of, threads, pinned
+):
+    monkeypatch.setattr(opencl.sys, "platform", "linux")
+    monkeypatch.setattr(opencl.os, "sched_getaffinity", lambda _: cores, raising=False)
+    monkeypatch.setattr(opencl.os, "cpu_count", lambda: of)
+    assert bool(opencl._pinned(threads)) is pinned
+    monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", str(threads))
+    assert not opencl._pinned(threads)
+
+
+@pytest.mark.skipif(not opencl._pinned(default_threads()), reason="not all cores, or not Linux")
+def test_a_pinned_thread_of_opencl_has_one_core():
+    program = """
+import os
+from mmmgpu.backends import get_backend
+get_backend("opencl")
+cores = [os.sched_getaffinity(int(thread)) for thread in os.listdir("/proc/self/task")]
+print(sorted(core for own in cores if len(own) == 1 for core in own))
+"""
+    assert run(program) == f"{[*range(default_threads())]}\n"
 
 
 @pytest.mark.parametrize("variable", ["MMMGPU_THREADS", "POCL_MAX_PTHREAD_COUNT"])

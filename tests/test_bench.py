@@ -13,7 +13,7 @@ import pytest
 from commands import assert_refused, run_command
 
 from mmmgpu.backends import BACKENDS
-from mmmgpu.bench import cases, growth, machine, peers, pipeline, runs, startup
+from mmmgpu.bench import cases, growth, machine, peers, pipeline, runs, startup, threads
 from mmmgpu.bench.charts import draw_growth
 from mmmgpu.bench.comparison import compare_runs
 from mmmgpu.bench.endurance import measure_endurance
@@ -32,6 +32,7 @@ SMALL = {
     "splat": {"batch": 2, "height": 24, "width": 20, "channels": 3},
     "fill": {"batch": 2, "height": 15, "width": 18},
     "blend": {"number": 3, "height": 9, "width": 7},
+    "blend_large": {"number": 3, "height": 9, "width": 7},
     "sample": {"height": 12, "width": 17},
     "sample_at_random": {"height": 12, "width": 17},
     "scan": {"queries": 3, "corpus": 5, "points": 40},
@@ -47,8 +48,9 @@ def small(make):
 @pytest.mark.parametrize("make", cases.CASES, ids=lambda f: f.__name__)
 def test_all_contenders_of_a_kernel_give_the_answer_of_the_reference(make):
     found = measure(kernel_work(small(make), OURS, PEERS), ONCE)["contenders"]
-    assert {*OURS, "reference"} <= found.keys()
-    differences = [row["difference"] for who, row in found.items() if who != "reference"]
+    assert {*OURS, "reference", "copy"} <= found.keys()
+    differences = [row["difference"] for row in found.values() if "difference" in row]
+    assert len(differences) == len(found) - 2
     assert max(differences) < 1e-4
 
 
@@ -70,7 +72,7 @@ def test_bytes_are_those_of_the_arguments_and_the_answer(make):
         partial(matching_work, OURS, prototypes=4, frames=6, side=32),
         partial(trajectory_work, ["scipy"], seconds=1),
         partial(gdlr_work, seconds=1),
-        partial(training_work, seconds=2, dimensions=1),
+        partial(training_work, seconds=2, dimensions=2, checked=1),
     ],
     ids=lambda work: work.func.__name__,
 )
@@ -181,9 +183,8 @@ def test_works_of_other_sizes_are_not_compared():
 
 
 def test_a_target_is_met_or_not_by_the_best_backend():
-    results = run_of(warp=4, opencl=9, numba=5, **{"numpy peer": 14})
-    results["machine"]["copy_gb_per_s"] = 10
-    results["works"]["blend"] |= {"bytes": 36e6, "items": 1}
+    results = run_of(warp=4, opencl=9, numba=5, copy=3.6, **{"numpy peer": 14})
+    results["works"]["blend"]["items"] = 1
     results["works"]["splat"] = results["works"]["rbf"] = results["works"]["blend"]
     found = judge_targets(results)
     values = {name: (t["value"], t["met"]) for name, t in found.items()}
@@ -192,6 +193,10 @@ def test_a_target_is_met_or_not_by_the_best_backend():
     assert values["blend, passes over its bytes"] == (1.11, True)
     assert values["backends apart by at most"] == (2.25, False)
     assert "analysis [frames/s]" not in found  # nothing was measured
+    results["threads"] = {"gain": {"copy": [1, 2], "sample, warp": [1, 1.9], "scan, warp": [1, 3]}}
+    values = {name: (t["value"], t["met"]) for name, t in judge_targets(results).items()}
+    assert values["threads, sample, of a copy's gain"] == (0.95, True)
+    assert values["threads, distance_scan"] == (3, True)
 
 
 @pytest.mark.parametrize("power", [0.5, 1, 2])
@@ -202,20 +207,35 @@ def test_the_exponent_of_growth_is_that_of_the_power_law(monkeypatch, power):
     assert growth.grown("pages", "warp")["exponent"] == pytest.approx(power)
 
 
-def test_the_gain_of_threads_is_of_the_best_times():
-    def made(copy, *ms):
-        rows = {"warp": {"best_ms": ms[0], "first_ms": 1}, "reference": {"best_ms": ms[1]}}
-        works = {"scan": {"contenders": rows}}
-        return {"machine": {"copy_gb_per_s": copy}, "works": works}
+def test_a_copy_reads_and_writes_as_many_bytes_as_it_says(monkeypatch):
+    moved = []
+    monkeypatch.setattr(machine.np, "copyto", lambda *pair: moved.append([a.nbytes for a in pair]))
+    machine.copy_of(2400, threads=3)()
+    assert moved == 3 * [[400, 400]]
 
-    assert growth.best_of([made(5, 8, 1), made(4, 6, 2)]) == {"copy": 0.2, "scan, warp": 6}
+
+def test_the_gain_of_threads_is_the_median_of_turns():
+    assert threads.gains([[8, 4], [80, 10], [9, 3]]) == [1, 3]
+
+
+def test_more_threads_take_turns_with_one(monkeypatch):
+    monkeypatch.setenv("MMMGPU_THREADS", "2")
+    found = threads.measure_threads(["opencl"], works=["blend"], turns=1)
+    assert found["counts"] == [1, 2]
+    assert found["gain"].keys() == {"copy", "product", "blend, opencl"}
+    assert all(one == 1 < 10 * more for one, more in found["gain"].values())
+
+
+def test_threads_of_a_work_that_fails_say_why():
+    with pytest.raises(InputError, match=r"threads, blend, abacus: .*unknown backend 'abacus'"):
+        threads.measure_threads(["abacus"], works=["blend"], turns=1)
 
 
 def test_charts_say_the_exponents_and_the_gain_of_threads(tmp_path):
     found = {"counts": [1, 2000], "best_ms": [1.0, 2.0], "exponent": 0.125}
     chart = tmp_path / "growth.svg"
-    threads = {"counts": [1, 2, 3], "gain": {"scan, warp": [1.0, 1.9, 2.75]}}
-    draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, threads, chart)
+    gained = {"counts": [1, 2, 3], "gain": {"scan, warp": [1.0, 1.9, 2.75]}}
+    draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, gained, chart)
     drawn = chart.read_text()
     assert "warp: 0.12" in drawn
     assert "scan, warp: 2.75" in drawn
@@ -224,10 +244,10 @@ def test_charts_say_the_exponents_and_the_gain_of_threads(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("threads", "counts"), [(1, [1]), (2, [1, 2]), (6, [1, 2, 4, 6]), (8, [1, 2, 4, 8])]
+    ("number", "counts"), [(1, [1]), (2, [1, 2]), (6, [1, 2, 4, 6]), (8, [1, 2, 4, 8])]
 )
-def test_threads_are_tried_in_powers_of_two_and_all(threads, counts):
-    assert growth.up_to(threads) == counts
+def test_threads_are_tried_in_powers_of_two_and_all(number, counts):
+    assert threads.up_to(number) == counts
 
 
 def test_many_frames_leave_nothing_behind(backend):

@@ -25,7 +25,7 @@ RUN = 16  # points of a thread, as in kernels/sample
 WHITE = 65535  # of a texture, as in kernels/prototypes
 MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
 TOGETHER = 4, 2, 1  # mixtures whose flows are re-oriented at once: as many as there are enough of
-TILE = 16  # corpus rows packed at a time: small enough to stay in the cache
+TILE = 64  # corpus rows packed at a time
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ class Launches(ABC):
         """Copy the items `first` ... `first + count - 1` of the first axis."""
 
     @abstractmethod
-    def launch(
-        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
-    ) -> None:
-        """Run ``stem.name`` for the items `first` ... `first + count - 1`.
+    def launcher(
+        self, kernel: str, inputs: list[Any], outputs: list[Any]
+    ) -> Callable[[int, int], None]:
+        """What runs ``stem.name`` for the items `first` ... `first + count - 1`, given these two.
 
         The kernel's arguments are `inputs`, first, count and `outputs`.
         """
@@ -88,9 +88,16 @@ class Launches(ABC):
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         """Call `work(first, n)` for contiguous parts of `count` items, on all threads."""
 
+    def launch(
+        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
+    ) -> None:
+        """Run a kernel for the items `first` ... `first + count - 1`."""
+        self.launcher(kernel, inputs, outputs)(first, count)
+
     def launch_all(self, kernel: str, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Run a kernel for the items 0 ... `count` - 1 on all threads."""
-        self.split(count, lambda first, n: self.launch(kernel, first, n, inputs, outputs))
+        if count:
+            self.split(count, self.launcher(kernel, inputs, outputs))
 
     def forward_warp(self, field: Any, flow: Any) -> tuple[Any, Any]:
         fields, height, width, channels = field.shape
@@ -281,7 +288,12 @@ class Launches(ABC):
     def _packed(self, fields: Any, points: int, channels: int, first: int, count: int) -> Any:
         """Rows of `fields` (N, P, C) as padded planes, shape (count, C, V * 16)."""
         planes = self.empty(count, channels, math.ceil(points / LANES) * LANES)
-        self.launch("distance_scan.pack", first, count, [fields, points, channels], [planes])
+        whole = points - points % LANES if channels == 2 else 0
+        if whole:
+            self.launch("distance_scan.pack_flows", first, count, [fields, points], [planes])
+        if whole < points:
+            rest = [fields, points, channels, whole]
+            self.launch("distance_scan.pack", first, count, rest, [planes])
         return planes
 
 

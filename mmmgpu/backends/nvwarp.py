@@ -111,15 +111,20 @@ class Warp(Launches):
         with _faults_of(self.device):
             wp.copy(target, source, first * size, first * size, count * size)
 
-    def launch(
-        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
-    ) -> None:
+    def launcher(
+        self, kernel: str, inputs: list[Any], outputs: list[Any]
+    ) -> Callable[[int, int], None]:
         compiled, types = _kernel(kernel, self.device)
-        given = [*inputs, first, count, *outputs]
-        arguments = [_as_declared(a, t) for a, t in zip(given, types, strict=True)]
-        block = _block(self.device)
-        with _faults_of(self.device):
-            wp.launch(compiled, dim=count, inputs=arguments, device=self.device, block_dim=block)
+        device, block = wp.get_device(self.device), _block(self.device)
+        before = [_as_declared(a, t) for a, t in zip(inputs, types, strict=False)]
+        after = [_as_declared(a, t) for a, t in zip(outputs, types[len(before) + 2 :], strict=True)]
+
+        def launch(first: int, count: int) -> None:
+            given = [*before, first, count, *after]
+            with _faults_of(self.device):
+                wp.launch(compiled, dim=count, inputs=given, device=device, block_dim=block)
+
+        return launch
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         if not count:

@@ -7,6 +7,7 @@ sizes are fixed, for PoCL compiles a kernel anew for each.
 import functools
 import os
 import re
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,7 +29,8 @@ from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
 from mmmgpu.errors import DeviceError, InputError
 
-LOCAL = 16  # work-items of a group; 1 where there are too few to go round
+LOCAL = 16  # work-items of a group; 1 where there are fewer than `GROUPS` for each thread
+GROUPS = 32
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # PoCL before and after 4.0
 NO_PLATFORM = (
     "there is no OpenCL driver; pip install 'pyopencl[pocl]' brings one for the CPU, "
@@ -83,7 +85,8 @@ def _present(threads: int) -> dict[str, Any]:
         InputError: There is no driver.
     """
     name_unknown_cpu()
-    with _defaults(dict.fromkeys(THREADS, str(threads)) | _cache()):  # read when a driver loads
+    variables = dict.fromkeys(THREADS, str(threads)) | _pinned(threads) | _cache()
+    with _defaults(variables):  # read when a driver loads
         try:
             platforms = cl.get_platforms()
         except cl.LogicError:
@@ -93,6 +96,18 @@ def _present(threads: int) -> dict[str, Any]:
 
 
 _cache = functools.cache(cache_variables)
+
+
+def _pinned(threads: int) -> dict[str, str]:
+    """Keep each thread of PoCL on a core of its own, where it has all cores of the machine.
+
+    Threads that are woken together may get one core for some milliseconds. PoCL counts cores from
+    0: with fewer threads, the processes of a machine would all be on the first ones; more threads
+    than cores end the process.
+    """
+    own = sys.platform == "linux" and os.sched_getaffinity(0) == set(range(threads))
+    chosen = any(name in os.environ for name in THREADS)  # by the user, who may want more or fewer
+    return {"POCL_AFFINITY": "1"} if own and threads == os.cpu_count() and not chosen else {}
 
 
 def _devices(platform: Any) -> list[Any]:
@@ -166,14 +181,21 @@ class OpenCL(Launches):
         with _faults_of(self.name):
             cl.enqueue_copy(self.queue, target.data, source.data, **span)
 
-    def launch(
-        self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
-    ) -> None:
-        local = LOCAL if count >= LOCAL * self.queue.device.max_compute_units else 1
-        padded = -(-count // local) * local
-        arguments = [_argument(a) for a in (*inputs, first, count, *outputs)]
-        with _launching, _faults_of(self.name):
-            _kernel(self.queue.context, kernel)(self.queue, (padded,), (local,), *arguments)
+    def launcher(
+        self, kernel: str, inputs: list[Any], outputs: list[Any]
+    ) -> Callable[[int, int], None]:
+        compiled = _kernel(self.queue.context, kernel)
+        many = LOCAL * GROUPS * self.queue.device.max_compute_units
+        before, after = [_argument(a) for a in inputs], [_argument(a) for a in outputs]
+
+        def launch(first: int, count: int) -> None:
+            local = LOCAL if count >= many else 1
+            padded = -(-count // local) * local
+            given = [*before, np.int32(first), np.int32(count), *after]
+            with _launching, _faults_of(self.name):
+                compiled(self.queue, (padded,), (local,), *given)
+
+        return launch
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         """The driver has the threads. Wait for it: the memory of an input may be NumPy's."""
