@@ -45,7 +45,7 @@ __kernel void pack_flows(
     const int first,
     const int count,
     /* outputs */
-    __global float16 *restrict planes)    /* (count, 2, V, 16), whole vectors of points are written */
+    __global float16 *restrict planes)    /* (count, 2, V, 16): whole vectors are written */
 {
     const int tid = get_global_id(0);
     if (tid >= count)
@@ -53,13 +53,16 @@ __kernel void pack_flows(
     const int vectors = (points + LANES - 1) / LANES;
     const int target = 2 * tid * vectors;
     for (int v = 0; v < points / LANES; ++v) {
-        const float32u flow = *(__global const float32u *)(flows + 2 * ((first + tid) * points + v * LANES));
+        const int at = 2 * ((first + tid) * points + v * LANES);
+        const float32u flow = *(__global const float32u *)(flows + at);
         planes[target + v] = flow.even;
         planes[target + vectors + v] = flow.odd;
     }
 }
 
-/* sqrt(x), within 8e-7 of it: xy / sqrt(xyy), where y is 1/sqrt(x) by its bits, 0.75 < xyy < 0.844. */
+/* sqrt(x), within 8e-7 of it: xy / sqrt(xyy), where y is 1/sqrt(x) by its bits and
+ * 0.75 < xyy < 0.844.
+ */
 float16 root(const float16 x)
 {
     const float16 y = as_float16(MAGIC - (as_int16(x) >> 1));

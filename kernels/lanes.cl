@@ -1,7 +1,7 @@
 /* Vectors of 16 neighbours in a row of a plane, and what kernels do with them lane by lane.
  *
  * A plane is one channel of a picture in rows padded to whole vectors; a padded row is a pitch.
- * Operators and clang's own functions alone: PoCL calls its functions of 16 lanes, and inlines none.
+ * Operators and clang's own functions alone: PoCL calls its own of 16 lanes, and inlines none.
  */
 
 #ifndef __has_builtin
@@ -52,7 +52,7 @@ int16 whole(const float16 q)
     return n + (convert_float16(n) > q);
 }
 
-/* Where clang knows what is asked, whether any lane of a comparison is set takes two instructions. */
+/* Where clang sees a comparison, to know whether any lane is set takes two instructions. */
 int least(const int16 n)
 {
 #if __has_builtin(__builtin_reduce_min)

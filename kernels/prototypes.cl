@@ -1,9 +1,9 @@
 /* Prototypes moved along flows of the model and mixed: CE05, Eq. 2 in one launch.
  *
  * A worker takes one prototype after the other of a group of up to four mixtures: the flow that is
- * missing to it is carried to its pixels (orientation), for all at once, and these along that flow into
- * sums that belong to the worker alone (rings). Flows are planes, one a direction, with rows padded to
- * whole vectors; a padded row is a pitch.
+ * missing to it is carried to its pixels (orientation), for all at once, and these along that flow
+ * into sums that belong to the worker alone (rings). Flows are planes, one a direction, with rows
+ * padded to whole vectors; a padded row is a pitch.
  */
 
 #include "lanes.cl"

@@ -49,7 +49,6 @@ from mmmgpu.reselection import COVARIANCES, carry
 from mmmgpu.trajectories import scaled_smoothness
 from mmmgpu.trajectory_training import History, TrainedStream
 
-F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 CLASSES = ("broad", "kmeans", "paper")
@@ -239,16 +238,17 @@ class _Adaptation:
         Eq. 11-12, A (M' - 1, M - 1) and B (M', M): column k is old prototype k. Then alpha and beta
         of every clip.
         """
-        old, stretches = self.model.basis, frames.stretches
+        old = self.model.basis
         halves = np.array_split(old.images, 2)  # as stretches are, for all processes to have some
         own = [Pictures(f"prototypes-{i}", half) for i, half in enumerate(halves)]
-        pieces: list[Seen] = [*own, *stretches]
+        pieces: list[Seen] = [*own, *frames.stretches]
         flow, backend = self.options.flow, self.backend
         found = analyse(self.folder, pieces, basis, flow=flow, backend=backend)
-        alphas, betas = zip(*found, strict=True)
-        a, b = (np.concatenate(of[: len(own)]).T.astype(np.float64) for of in (alphas, betas))
-        clips = [frames.by_clip(of[len(own) :]) for of in (alphas, betas)]
-        return (a[:, old.moving], b), (clips[0], clips[1])
+        a, b = (
+            np.concatenate(z).T.astype(np.float64) for z in zip(*found[: len(own)], strict=True)
+        )
+        alpha, beta = (frames.by_clip(z) for z in zip(*found[len(own) :], strict=True))
+        return (a[:, old.moving], b), (alpha, beta)
 
     def _classes(self, before: Sequence[PhonemeModels]) -> Classes:
         """The phones that move together."""

@@ -72,6 +72,12 @@ class Piece(Protocol):
     def length(self) -> int: ...
 
 
+class Seen(Piece, Protocol):
+    """A piece that can be seen, picture by picture."""
+
+    def crops(self, region: Region) -> Iterable[F32]: ...
+
+
 def for_all(
     folder: Path,
     prepare: Callable[[Any], Work],
@@ -143,12 +149,6 @@ def _tracking(shared: tuple[Path, Reference, F32 | None]) -> Work:
         write_step(folder, f"track-{clip.name}", arrays)
 
     return work
-
-
-class Seen(Piece, Protocol):
-    """A piece that can be seen."""
-
-    def crops(self, region: Region) -> Iterable[F32]: ...
 
 
 def analyse_corpus(

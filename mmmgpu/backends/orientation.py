@@ -124,31 +124,31 @@ def _starts(lengths: Sequence[int] | NDArray[Any]) -> I32:
 
 def _parts(target: Numbers, source: Numbers, h: int, w: int) -> tuple[Numbers, I32]:
     """Which pixels are sources of which, by vector and distance: numbers of parts, and these."""
-    (y, x), (down, right) = _places(target, w), _places(source, w)
-    across, lane = _places(x, LANES)
+    (y, x), (down, right) = _divided(target, w), _divided(source, w)
+    across, lane = _divided(x, LANES)
     vector = y * (pitch_of(w) // LANES) + across
     reach = 2 * w - 1
     distance = (down - y + h - 1) * reach + right - x + w - 1
     given = (vector * ((2 * h - 1) * reach) + distance) * LANES + lane
     given.sort()
-    part, lane = _places(given, LANES)
+    part, lane = _divided(given, LANES)
     starts = np.flatnonzero(np.diff(part, prepend=-1))
     lanes = np.add.reduceat(1 << lane, starts)
-    vector, distance = _places(part[starts], (2 * h - 1) * reach)
-    down, right = _places(distance, reach)
+    vector, distance = _divided(part[starts], (2 * h - 1) * reach)
+    down, right = _divided(distance, reach)
     parts = np.stack([right - w + 1, down - h + 1, lanes], axis=1).astype(np.int32)
     return np.bincount(vector, minlength=h * pitch_of(w) // LANES), parts
 
 
-def _places(pixels: Numbers, width: int) -> tuple[Numbers, Numbers]:
-    """Row and column of pixels; `divmod` of NumPy takes twice as long."""
-    y = pixels // width
-    return y, pixels - y * width
+def _divided(numbers: Numbers, by: int) -> tuple[Numbers, Numbers]:
+    """Quotients and remainders; `divmod` of NumPy takes twice as long."""
+    quotient = numbers // by
+    return quotient, numbers - quotient * by
 
 
 def _padded(pixels: NDArray[Any], width: int) -> Numbers:
     """Numbers of pixels in padded rows."""
-    y, x = _places(pixels.astype(np.int64), width)
+    y, x = _divided(pixels.astype(np.int64), width)
     return y * pitch_of(width) + x
 
 
@@ -158,7 +158,7 @@ def _filling(valid: NDArray[np.bool_]) -> tuple[Any, Any]:
     Only the cells are there that a hole needs and that have a valid pixel.
     """
     h, w = valid.shape
-    y, x = _places(np.arange(h * w), w)
+    y, x = _divided(np.arange(h * w), w)
     inside = valid.ravel()
     empty = np.flatnonzero(~inside)
     needs = sparse.identity(len(empty), format="csr")
@@ -184,7 +184,7 @@ def _filling(valid: NDArray[np.bool_]) -> tuple[Any, Any]:
 def _between(pixels: Numbers, h: int, w: int) -> Any:
     """Some pixels of a level of h x w, interpolated from the next coarser one: (n, cells)."""
     rows, columns = (h + 1) // 2, (w + 1) // 2
-    y, x = _places(pixels, w)
+    y, x = _divided(pixels, w)
     y0, x0 = y // 2, x // 2
     y1 = np.clip(y0 + 2 * (y % 2) - 1, 0, rows - 1)
     x1 = np.clip(x0 + 2 * (x % 2) - 1, 0, columns - 1)
