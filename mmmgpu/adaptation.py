@@ -6,7 +6,7 @@ Then the means are adapted to B's own trajectories, class by class (Eq. 14-17, `
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,11 +22,11 @@ from mmmgpu.corpus_steps import (
     Frames,
     Pictures,
     Seen,
-    Thumbnails,
     analyse,
     calmest,
     fit_dynamics,
     fit_streams,
+    look,
     make_model,
     rebased_frames,
     track_corpus,
@@ -46,9 +46,11 @@ from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, principal_coordinates
 from mmmgpu.regression_classes import Classes, broad_classes, kmeans_classes, paper_classes
 from mmmgpu.reselection import COVARIANCES, carry
+from mmmgpu.tracked_clips import kept_tracks, known_tracks
 from mmmgpu.trajectories import scaled_smoothness
 from mmmgpu.trajectory_training import History, TrainedStream
 
+F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 CLASSES = ("broad", "kmeans", "paper")
@@ -120,6 +122,8 @@ def adapt(
         "options": vars(options),
         "reference": list(model.sources[model.basis.reference]),
         "box": list(model.basis.region.box),
+        "sources": [list(place) for place in model.sources],
+        "tracked": {name: clip.sha256 for name, clip in model.tracked.items()},
         "adapt": 1,
     }
     return make_model(
@@ -180,10 +184,12 @@ class _Adaptation:
 
     def run(self) -> Model:
         model, options = self.model, self.options
-        tracks, skipped = track_corpus(self.folder, self.corpus, model.reference)
-        frames = rebased_frames(self.corpus, tracks, *model.sources[model.basis.reference])
-        chosen, basis = self._reselect(frames)
-        to_new, analysed = self._analyse(frames, basis)
+        known = known_tracks(self.corpus, model.tracked)
+        tracked, skipped = track_corpus(self.folder, self.corpus, model.reference, known)
+        coordinates = principal_coordinates(look(self.folder, tracked, model.basis.region))
+        frames = rebased_frames(tracked, *model.sources[model.basis.reference])
+        chosen, basis = self._reselect(frames, coordinates)
+        to_new, analysed = self._analyse(frames, basis, frozenset(known))
         weights = flow_weights(basis), texture_weights(basis, backend=self.backend)
         starts = [
             _Start(_carried(old, matrix, options.covariance), utterances_of(frames, z), seen)
@@ -214,11 +220,11 @@ class _Adaptation:
                 if m not in ("none", options.method)
             },
             dynamics=dynamics,
+            tracked=kept_tracks(tracked.clips, tracked.tracks),
         )
 
-    def _reselect(self, frames: Frames) -> tuple[NDArray[np.int64], Basis]:
+    def _reselect(self, frames: Frames, coordinates: F32) -> tuple[NDArray[np.int64], Basis]:
         """New prototypes from these clips, the reference frame among them, and their basis."""
-        coordinates = principal_coordinates(Thumbnails(self.folder, frames.clips))
         usable = np.flatnonzero(frames.registered)
         count = min(len(self.model.sources), len(usable))
         chosen = usable[choose_prototypes(coordinates[usable], count, seed=self.options.seed)]
@@ -231,24 +237,25 @@ class _Adaptation:
         return chosen, replace(basis, w_f=self.model.basis.w_f, w_t=self.model.basis.w_t)
 
     def _analyse(
-        self, frames: Frames, basis: Basis
+        self, frames: Frames, basis: Basis, known: Set[str]
     ) -> tuple[tuple[Floats, Floats], tuple[list[Floats], list[Floats]]]:
         """The old prototypes and the clips in the new ones.
 
         Eq. 11-12, A (M' - 1, M - 1) and B (M', M): column k is old prototype k. Then alpha and beta
-        of every clip.
+        of every clip. Old prototypes from clips that are `known` are among the frames.
         """
-        old = self.model.basis
-        halves = np.array_split(old.images, 2)  # as stretches are, for all processes to have some
-        own = [Pictures(f"prototypes-{i}", half) for i, half in enumerate(halves)]
-        pieces: list[Seen] = [*own, *frames.stretches]
+        old, sources = self.model.basis, self.model.sources
+        strange = np.array([k for k, (name, _) in enumerate(sources) if name not in known], int)
+        halves = np.array_split(strange, 2)  # as stretches are, for all processes to have some
+        own = [Pictures(f"prototypes-{i}", old.images[k]) for i, k in enumerate(halves) if len(k)]
+        pieces: list[Seen] = [*frames.stretches, *own]
         flow, backend = self.options.flow, self.backend
         found = analyse(self.folder, pieces, basis, flow=flow, backend=backend)
-        a, b = (
-            np.concatenate(z).T.astype(np.float64) for z in zip(*found[: len(own)], strict=True)
-        )
-        alpha, beta = (frames.by_clip(z) for z in zip(*found[len(own) :], strict=True))
-        return (a[:, old.moving], b), (alpha, beta)
+        alpha, beta = map(np.concatenate, zip(*found, strict=True))
+        last = {int(k): len(frames) + i for i, k in enumerate(strange)}
+        rows = [last[k] if k in last else frames.number(*at) for k, at in enumerate(sources)]
+        a, b = (z[rows].T.astype(np.float64) for z in (alpha, beta))
+        return (a[:, old.moving], b), (frames.by_clip(alpha), frames.by_clip(beta))
 
     def _classes(self, before: Sequence[PhonemeModels]) -> Classes:
         """The phones that move together."""

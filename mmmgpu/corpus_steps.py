@@ -106,35 +106,38 @@ def finished_step(folder: Path, step: str, piece: Piece) -> dict[str, NDArray[An
 
 
 def track_corpus(
-    folder: Path, corpus: Sequence[Clip], reference: Reference, *, thumbnails: bool = True
-) -> tuple[dict[str, Track], dict[str, str]]:
-    """Tracks by clip name, and why other clips were skipped; `Thumbnails` are left in `folder`.
+    folder: Path,
+    corpus: Sequence[Clip],
+    reference: Reference,
+    known: Mapping[str, Track] | None = None,
+) -> tuple["Frames", dict[str, str]]:
+    """The clips whose head is found, as `reference` sees them; and why others were skipped.
+
+    known: tracks by clip name, of clips that need no tracking.
 
     Raises:
         InputError: The head is found in no clip.
     """
-    shared = (folder, reference, mouth_mask(reference.region) if thumbnails else None)
-    for_all(folder, _tracking, shared, "track", "track frames", corpus)
-    tracks, skipped = {}, {}
-    for clip in corpus:
+    tracks, skipped = dict(known or {}), {}
+    unknown = [clip for clip in corpus if clip.name not in tracks]
+    for_all(folder, _tracking, (folder, reference), "track", "track frames", unknown)
+    for clip in unknown:
         name = clip.name
         arrays = finished_step(folder, "track", clip)
         if "skipped" in arrays:
             skipped[name] = str(arrays["skipped"])
             print(f"warning: skipped: {skipped[name]}", file=sys.stderr)
         else:
-            fields = {f: arrays[f] for f in arrays if f not in ("thumbnails", "residual")}
-            tracks[name] = Track(**fields, residual=float(arrays["residual"]))
+            residual = float(arrays.pop("residual"))
+            tracks[name] = Track(**arrays, residual=residual)
     if not tracks:
         raise InputError(next(iter(skipped.values())))
-    return tracks, skipped
+    return Frames([clip for clip in corpus if clip.name in tracks], tracks), skipped
 
 
-def _tracking(shared: tuple[Path, Reference, F32 | None]) -> Work:
-    """Keeps the track of a clip and, with a mask, a thumbnail of every frame; or why it must be
-    left out.
-    """
-    folder, reference, mask = shared
+def _tracking(shared: tuple[Path, Reference]) -> Work:
+    """Keeps the track of a clip, or why it must be left out."""
+    folder, reference = shared
 
     def work(clip: Clip, tick: Tick) -> None:
         try:
@@ -143,10 +146,29 @@ def _tracking(shared: tuple[Path, Reference, F32 | None]) -> Work:
             write_step(folder, f"track-{clip.name}", {"skipped": np.array(str(e))})
             return
         arrays = vars(track) | {"residual": np.array(track.residual)}
-        if mask is not None:
-            images = crops(clip.path, track, reference.region)
-            arrays["thumbnails"] = np.array([byte_thumbnail(image, mask) for image in images])
         write_step(folder, f"track-{clip.name}", arrays)
+
+    return work
+
+
+def look(folder: Path, frames: "Frames", region: Region) -> "Thumbnails":
+    """Small pictures of the mouth in every frame, left in `folder`; `region` is its region."""
+    shared = (folder, region)
+    for_all(folder, _looking, shared, "thumbnails", "look at frames", frames.stretches)
+    return Thumbnails(folder, frames)
+
+
+def _looking(shared: tuple[Path, Region]) -> Work:
+    """Keeps a thumbnail of every frame of a stretch."""
+    folder, region = shared
+    mask = mouth_mask(region)
+
+    def work(stretch: Stretch, tick: Tick) -> None:
+        found = []
+        for image in stretch.crops(region):
+            found.append(byte_thumbnail(image, mask))
+            tick()
+        write_step(folder, f"thumbnails-{stretch.name}", {"thumbnails": np.array(found)})
 
     return work
 
@@ -156,7 +178,7 @@ def analyse_corpus(
 ) -> tuple[list[Floats], list[Floats]]:
     """alpha (T, M - 1) and beta (T, M) of every clip of `frames`."""
     found = analyse(folder, frames.stretches, basis, flow=flow, backend=backend)
-    alpha, beta = (frames.by_clip(parts) for parts in zip(*found, strict=True))
+    alpha, beta = (frames.by_clip(np.concatenate(z)) for z in zip(*found, strict=True))
     return alpha, beta
 
 
@@ -236,13 +258,15 @@ class Thumbnails(Sequence[NDArray[np.uint8]]):
     """The thumbnails of all clips, read from the work folder one clip at a time."""
 
     folder: Path
-    clips: Sequence[Clip]
+    frames: "Frames"
 
     def __len__(self) -> int:
-        return len(self.clips)
+        return len(self.frames.clips)
 
     def __getitem__(self, i: Any) -> Any:
-        return finished_step(self.folder, "track", self.clips[i])["thumbnails"]
+        stretches = self.frames.stretches_of(self.frames.clips[i])
+        found = [finished_step(self.folder, "thumbnails", stretch) for stretch in stretches]
+        return np.concatenate([one["thumbnails"] for one in found])
 
 
 @dataclass(frozen=True)
@@ -251,6 +275,9 @@ class Frames:
 
     clips: Sequence[Clip]
     tracks: Mapping[str, Track]
+
+    def __len__(self) -> int:
+        return sum(clip.length for clip in self.clips)
 
     @property
     def registered(self) -> NDArray[np.bool_]:
@@ -266,21 +293,19 @@ class Frames:
 
     @property
     def stretches(self) -> list[Stretch]:
-        """All frames in order; few clips are cut, so that all processes end at the same time."""
-        found = []
-        for clip in self.clips:
-            parts = min(clip.length, -(-STRETCHES // len(self.clips)))
-            ends = [clip.length * part // parts for part in range(parts + 1)]
-            track = self.tracks[clip.name]
-            found += [Stretch(clip, track, *ends[part : part + 2]) for part in range(parts)]
-        return found
+        """All frames in order."""
+        return [stretch for clip in self.clips for stretch in self.stretches_of(clip)]
 
-    def by_clip(self, parts: Sequence[Floats]) -> list[Floats]:
-        """What was found for the stretches, (t, d) each, joined to one (T, d) a clip."""
-        found: dict[str, list[Floats]] = {clip.name: [] for clip in self.clips}
-        for stretch, part in zip(self.stretches, parts, strict=True):
-            found[stretch.clip.name].append(part)
-        return [np.concatenate(of) for of in found.values()]
+    def stretches_of(self, clip: Clip) -> list[Stretch]:
+        """The frames of `clip`; few clips are cut, so that all processes end at the same time."""
+        parts = min(clip.length, -(-STRETCHES // len(self.clips)))
+        ends = [clip.length * part // parts for part in range(parts + 1)]
+        track = self.tracks[clip.name]
+        return [Stretch(clip, track, *ends[part : part + 2]) for part in range(parts)]
+
+    def by_clip(self, rows: Floats) -> list[Floats]:
+        """Rows of all frames, and others behind them, (N, d) -> (T, d) of every clip."""
+        return np.split(rows, np.cumsum([clip.length for clip in self.clips]))[:-1]
 
     def pictures(
         self, numbers: Iterable[int]
@@ -319,22 +344,21 @@ class Frames:
             first += clip.length
 
 
-def rebased_frames(
-    corpus: Sequence[Clip], tracks: Mapping[str, Track], name: str, t: int
-) -> Frames:
-    """The tracked clips as frame `t` of the clip called `name` sees them: its pose is the identity.
+def rebased_frames(frames: Frames, name: str, t: int) -> Frames:
+    """`frames` as frame `t` of the clip called `name` sees them: its pose is the identity.
 
     Its gain becomes 1 and its offset 0.
 
     Raises:
         InputError: That clip was not tracked.
     """
+    tracks = frames.tracks
     if name not in tracks:
         raise InputError(f"{name}: holds the reference frame, but its head was not found there")
     first = tracks[name]
     pose = first.poses[t]
     rebased = {n: rebase(track, pose, first.gain, first.offset) for n, track in tracks.items()}
-    return Frames([clip for clip in corpus if clip.name in tracks], rebased)
+    return Frames(frames.clips, rebased)
 
 
 def tracking_notes(frames: Frames, skipped: Mapping[str, str]) -> dict[str, Any]:

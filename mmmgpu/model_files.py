@@ -23,12 +23,14 @@ from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.regions import Region
 from mmmgpu.registration import Head
 from mmmgpu.tensor_files import FileKind, Tensors, check_tensors, read_tensors, write_tensors
+from mmmgpu.tracked_clips import TrackedClip
 from mmmgpu.tracks import Reference, Track
 from mmmgpu.trajectory_training import Constants, History, TrainedStream
 
 FORMAT = "mmmgpu-model"
 VERSION = 1
 STREAMS = ("alpha", "beta")
+OF_TRACKS = ("poses", "registered", "correlation", "gain", "offset")
 KIND = FileKind(FORMAT, VERSION, "model", "mmmgpu train", "train it again")
 
 
@@ -65,6 +67,11 @@ def _check_facts(path: Path, facts: dict[str, Any]) -> None:
         "fps": [type(v) for v in fps] == [int] * 2 and min(fps) > 0,
         "calm.suffix": re.fullmatch(r"(\.[^./\\\0]+)?", facts["calm"]["suffix"]) is not None,
         "calm.residual": bool(np.isfinite(facts["calm"]["residual"])),
+        "tracked": all(
+            {"clip": str, "sha256": str, "residual": float} == {n: type(v) for n, v in one.items()}
+            and np.isfinite(one["residual"])
+            for one in _tracked_facts(facts)
+        ),
     }
     for name, is_good in good.items():
         if not is_good:
@@ -73,7 +80,7 @@ def _check_facts(path: Path, facts: dict[str, Any]) -> None:
 
 def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
     """Every tensor has the shape and type that the others imply, and is finite."""
-    frames, calm = len(tensors["calm.poses"]), tensors["calm.data"].size
+    calm = tensors["calm.data"].size
     m, (h, w) = len(facts["sources"]), facts["region"]["box"][:1:-1]
     points = len(tensors["reference.colours"])
     patch = tensors["head.patch"].shape
@@ -88,12 +95,10 @@ def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
         "reference.colour_points": ((points, 2), "f8"),
         "prototype_frames": ((m, facts["frame_size"][1], facts["frame_size"][0], 3), "u1"),
         "calm.data": ((calm,), "u1"),
-        "calm.poses": ((frames, 3, 3), "f8"),
-        "calm.registered": ((frames,), "b1"),
-        "calm.correlation": ((frames,), "f8"),
-        "calm.gain": ((3,), "f8"),
-        "calm.offset": ((3,), "f8"),
     }
+    tracks = ["calm", *(_tracked_name(i) for i, _ in enumerate(_tracked_facts(facts)))]
+    for name in tracks:
+        wanted |= _track_shapes(name, tensors)
     for name, d in (("alpha", m - 1), ("beta", m)):
         phones = len(facts[name]["labels"])
         wanted |= {
@@ -118,10 +123,35 @@ def _check_tensors(path: Path, tensors: Tensors, facts: dict[str, Any]) -> None:
             )
         if name.endswith(".variance") and not (tensor > 0).all():
             raise InputError(f"{path}: tensor {name} must be above zero; train the model again")
-        if name in ("calm.poses", "head.to_frame") and not np.linalg.det(tensor).all():
+        if name.endswith((".poses", ".to_frame")) and not np.linalg.det(tensor).all():
             raise InputError(f"{path}: tensor {name} cannot be inverted; train the model again")
-    if frames < 1:
-        raise InputError(f"{path}: the model has no background; train it again")
+    for name in tracks:
+        if not len(tensors[f"{name}.poses"]):
+            raise InputError(f"{path}: tensor {name}.poses has no frames; train the model again")
+
+
+def _tracked_facts(facts: dict[str, Any]) -> list[dict[str, Any]]:
+    """What is said of the tracked clips; nothing in files from before there were any."""
+    found: list[dict[str, Any]] = facts.get("tracked", [])
+    return found
+
+
+def _tracked_name(i: int) -> str:
+    return f"tracked.{i}"
+
+
+def _track_shapes(name: str, tensors: Tensors) -> dict[str, tuple[tuple[int, ...], str]]:
+    frames = len(tensors[f"{name}.poses"])
+    shapes = (((frames, 3, 3), "f8"), ((frames,), "b1"), ((frames,), "f8"), ((3,), "f8"))
+    return {f"{name}.{n}": s for n, s in zip(OF_TRACKS, (*shapes, shapes[-1]), strict=True)}
+
+
+def _track_tensors(name: str, track: Track) -> Tensors:
+    return {f"{name}.{n}": getattr(track, n) for n in OF_TRACKS}
+
+
+def _track(name: str, t: Tensors, residual: float) -> Track:
+    return Track(**{n: t[f"{name}.{n}"] for n in OF_TRACKS}, residual=residual)
 
 
 def _facts(model: Model) -> dict[str, Any]:
@@ -138,6 +168,10 @@ def _facts(model: Model) -> dict[str, Any]:
         "dynamics": {
             name: [facts_of(one) for one in pair] for name, pair in model.dynamics.items()
         },
+        "tracked": [
+            {"clip": name, "sha256": clip.sha256, "residual": clip.track.residual}
+            for name, clip in model.tracked.items()
+        ],
         "notes": model.notes,
     }
 
@@ -165,12 +199,10 @@ def _tensors(model: Model) -> Tensors:
         "reference.colour_points": model.reference.colour_points,
         "prototype_frames": model.prototype_frames,
         "calm.data": calm.data,
-        "calm.poses": calm.track.poses,
-        "calm.registered": calm.track.registered,
-        "calm.correlation": calm.track.correlation,
-        "calm.gain": calm.track.gain,
-        "calm.offset": calm.track.offset,
+        **_track_tensors("calm", calm.track),
     }
+    for i, clip in enumerate(model.tracked.values()):
+        tensors |= _track_tensors(_tracked_name(i), clip.track)
     for name, stream in (("alpha", model.alpha), ("beta", model.beta)):
         for kind, models in (("pooled", stream.pooled), ("trained", stream.trained)):
             tensors[f"{name}.{kind}.mean"] = models.mean
@@ -198,8 +230,7 @@ def _assemble(t: Tensors, facts: dict[str, Any]) -> Model:
         t["images"], t["flows"], facts["reference"], region, t["w_f"], t["w_t"], t["cover"]
     )
     head = Head(t["head.patch"], t["head.mask"], t["head.to_frame"])
-    seen = ("poses", "registered", "correlation", "gain", "offset")
-    track = Track(**{n: t[f"calm.{n}"] for n in seen}, residual=facts["calm"]["residual"])
+    calm, tracked = facts["calm"], _tracked_facts(facts)
     return Model(
         basis=basis,
         reference=Reference(head, t["reference.colours"], t["reference.colour_points"], region),
@@ -208,13 +239,17 @@ def _assemble(t: Tensors, facts: dict[str, Any]) -> Model:
         fps=Fraction(*facts["fps"]),
         prototype_frames=t["prototype_frames"],
         sources=tuple((str(clip), int(frame)) for clip, frame in facts["sources"]),
-        calm=Calm(t["calm.data"], facts["calm"]["suffix"], track),
+        calm=Calm(t["calm.data"], calm["suffix"], _track("calm", t, calm["residual"])),
         notes=facts["notes"],
         alternatives={
             other: (t[f"alpha.{other}.mean"], t[f"beta.{other}.mean"])
             for other in facts["alternatives"]
         },
         dynamics=_dynamics(t, facts),
+        tracked={
+            one["clip"]: TrackedClip(one["sha256"], _track(_tracked_name(i), t, one["residual"]))
+            for i, one in enumerate(tracked)
+        },
     )
 
 

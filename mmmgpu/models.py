@@ -16,6 +16,7 @@ from mmmgpu.dynamics import Dynamics, trajectory
 from mmmgpu.errors import InputError
 from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.phones import stand_in
+from mmmgpu.tracked_clips import TrackedClip
 from mmmgpu.tracks import Reference, Track
 from mmmgpu.trajectories import synthesize_trajectory
 from mmmgpu.trajectory_training import TrainedStream
@@ -54,6 +55,7 @@ class Model:
     alternatives: by name, the means (P, M - 1) and (P, M) that other ways of adaptation gave, for
         comparison; all else of the phoneme models is that of the trained ones.
     dynamics: by name (`mmmgpu.dynamics.MODELS`), other models of alpha and of beta.
+    tracked: by name, the clips that a transferred face was taken from.
     """
 
     basis: Basis
@@ -67,6 +69,7 @@ class Model:
     notes: dict[str, Any] = field(default_factory=dict)
     alternatives: dict[str, tuple[Floats, Floats]] = field(default_factory=dict)
     dynamics: dict[str, tuple[Dynamics, Dynamics]] = field(default_factory=dict)
+    tracked: dict[str, TrackedClip] = field(default_factory=dict)
 
     @property
     def frame_size(self) -> tuple[int, int]:

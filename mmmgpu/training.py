@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from mmmgpu.corpora import Clip, check_rates, open_corpus
 from mmmgpu.corpus_steps import (
     Frames,
-    Thumbnails,
     analyse_corpus,
     calmest,
     fit_dynamics,
     fit_streams,
+    look,
     make_model,
     rebased_frames,
     track_corpus,
@@ -37,6 +37,7 @@ from mmmgpu.processes import Tick
 from mmmgpu.prototype_flows import prototype_basis
 from mmmgpu.prototypes import choose_prototypes, most_neutral, principal_coordinates
 from mmmgpu.references import check_sound, find_reference, rebase_reference
+from mmmgpu.regions import Region
 from mmmgpu.trajectory_training import TrainedStream, fit_stream
 
 F32 = NDArray[np.float32]
@@ -107,16 +108,14 @@ class _Training:
 
     def run(self) -> Model:
         provisional = find_reference(self.corpus, self.options.region, sync=self.options.sync)
-        tracks, skipped = track_corpus(self.folder, self.corpus, provisional)
-        used = [clip for clip in self.corpus if clip.name in tracks]
-        frames = Frames(used, tracks)
-        chosen, reference_frame, coordinates = self._choose(frames)
+        frames, skipped = track_corpus(self.folder, self.corpus, provisional)
+        chosen, reference_frame, coordinates = self._choose(frames, provisional.region)
         clip, t = frames.find(reference_frame)
         size = (clip.info.width, clip.info.height)
-        first = tracks[clip.name]
+        first = frames.tracks[clip.name]
         kept = self.options.region is not None
         reference = rebase_reference(provisional, first, t, size, keep_box=kept)
-        frames = rebased_frames(used, tracks, clip.name, t)
+        frames = rebased_frames(frames, clip.name, t)
         flow = self.options.flow
         basis = prototype_basis(
             frames, reference.region, chosen, reference_frame, coordinates, flow=flow
@@ -132,7 +131,7 @@ class _Training:
             reference=reference,
             alpha=alpha,
             beta=beta,
-            fps=used[0].info.fps,
+            fps=frames.clips[0].info.fps,
             prototype_frames=whole,
             sources=sources,
             calm=calmest(frames),
@@ -140,9 +139,9 @@ class _Training:
             dynamics=dynamics,
         )
 
-    def _choose(self, frames: Frames) -> tuple[NDArray[np.int64], int, F32]:
+    def _choose(self, frames: Frames, region: Region) -> tuple[NDArray[np.int64], int, F32]:
         """Prototype frames, the reference among them, and the PCA coordinates of all frames."""
-        coordinates = principal_coordinates(Thumbnails(self.folder, frames.clips))
+        coordinates = principal_coordinates(look(self.folder, frames, region))
         usable = np.flatnonzero(frames.registered)
         chosen = choose_prototypes(
             coordinates[usable], self.options.prototypes, seed=self.options.seed

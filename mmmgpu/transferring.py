@@ -44,6 +44,7 @@ from mmmgpu.processes import Tick, Work
 from mmmgpu.reference_pairs import pose_of
 from mmmgpu.regions import Region, carried_mouth, mouth_mask, region_around
 from mmmgpu.registration import head_from_frame, project
+from mmmgpu.tracked_clips import kept_tracks
 from mmmgpu.tracks import Reference, crop, frame_at, make_reference
 
 F32 = NDArray[np.float32]
@@ -172,7 +173,9 @@ class _Transfer:
 
     def run(self) -> Model:
         reference, old = self._reference(), self.source.basis
-        frames, skipped = self._track(reference)
+        tracked, skipped = self._track(reference)
+        at = self.marked[CLOSED].pair.b
+        frames = rebased_frames(tracked, at.clip, at.frame)
         region, usable = reference.region, np.flatnonzero(frames.registered)
         to_region = self._correspondence(frames, CLOSED, region)
         w_f, w_t = (carried_mask(m, to_region, region.shape) for m in (old.w_f, old.w_t))
@@ -208,6 +211,7 @@ class _Transfer:
             sources=sources,
             calm=calmest(frames),
             notes=self._notes(frames, skipped, matching, near),
+            tracked=kept_tracks(tracked.clips, tracked.tracks),
         )
 
     def _reference(self) -> Reference:
@@ -220,16 +224,15 @@ class _Transfer:
         return make_reference(closed.picture, head, region_around(mouth, (width, height)))
 
     def _track(self, reference: Reference) -> tuple[Frames, dict[str, str]]:
-        """B's frames as the closed reference frame sees them: its own pose is the identity."""
-        tracks, skipped = track_corpus(self.folder, self.corpus, reference, thumbnails=False)
+        """B's frames, those that are marked among them; and the clips left out, with reasons."""
+        frames, skipped = track_corpus(self.folder, self.corpus, reference)
         for kind, marked in self.marked.items():
-            if marked.pair.b.clip not in tracks:
+            if marked.pair.b.clip not in frames.tracks:
                 raise InputError(
                     f"{marked.pair.b.clip}: holds the {kind} reference frame, but its head was "
                     "not found in the clip; mark another frame"
                 )
-        at = self.marked[CLOSED].pair.b
-        return rebased_frames(self.corpus, tracks, at.clip, at.frame), skipped
+        return frames, skipped
 
     def _number(self, frames: Frames, kind: str) -> int:
         at = self.marked[kind].pair.b

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from pairs import interrupt_second_step
 
+from mmmgpu import corpus_steps
 from mmmgpu.adaptation import OTHER_STEP, AdaptOptions, adapt
 from mmmgpu.adaptation_folds import METHODS
 from mmmgpu.alignments import Alignment, cover, read_alignment, write_textgrid
@@ -126,14 +127,41 @@ def test_what_was_tried_is_kept(adapted):
     assert sum(coverage["frames"].values()) / 40 == pytest.approx(coverage["frames_per_phone"])
 
 
+def test_clips_known_from_transfer_are_neither_tracked_nor_analysed_again(
+    two_persons, before, adapted, tmp_path, monkeypatch
+):
+    """It is as if they were: the same bytes come of it."""
+    done = {}
+
+    def spy(folder, prepare, shared, step, label, pieces):
+        done[step] = [piece.name for piece in pieces]
+        for_all(folder, prepare, shared, step, label, pieces)
+
+    for_all = corpus_steps.for_all
+    monkeypatch.setattr(corpus_steps, "for_all", spy)
+    out, clips = tmp_path / "a.mmm", two_persons.second.clips
+    take_style(two_persons, before, out)
+    assert set(before.tracked) == {clip.name for clip in clips}
+    assert done["track"] == []
+    assert not any(name.startswith("prototypes") for name in done["analysis"])
+    assert out.read_bytes() == adapted[0].read_bytes()
+    one = {clips[0].name: before.tracked[clips[0].name]}
+    take_style(two_persons, replace(before, tracked=one), out)
+    assert done["track"] == [clip.name for clip in clips[1:]]
+    assert done["analysis"][-2:] == ["prototypes-0", "prototypes-1"]
+    assert out.read_bytes() == adapted[0].read_bytes()
+
+
 def test_an_interrupted_adaptation_continues_to_the_same_bytes(
     two_persons, before, adapted, tmp_path, monkeypatch
 ):
     out = tmp_path / "again.mmm"
     calls = interrupt_second_step(monkeypatch)
+    strange = replace(before, tracked={})
     with pytest.raises(KeyboardInterrupt):
-        take_style(two_persons, before, out)
-    take_style(two_persons, before, out)
+        take_style(two_persons, strange, out)
+    take_style(two_persons, strange, out)
+    assert len(calls[0]) == len(two_persons.second.clips)
     assert calls[2] == []  # nothing is tracked again
     assert out.read_bytes() == adapted[0].read_bytes()
     assert [p.name for p in tmp_path.iterdir()] == [out.name]

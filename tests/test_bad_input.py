@@ -468,7 +468,7 @@ def test_no_room_for_the_rest_of_a_file(model, world, command, out):
         "speak": (*spoken, "--lossless", "--background", world.clips[0]),
         "own background": spoken,
     }
-    limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); "
+    limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000)); "
     done = start(*args[command], before=limited, cwd=out)
     _, err = done.communicate()
     assert done.returncode == 1

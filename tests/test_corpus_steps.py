@@ -32,10 +32,11 @@ def test_the_stretches_of_a_clip_are_of_about_one_length():
 
 
 @pytest.mark.parametrize("lengths", [(75,) * 5, (3,), (20, 1, 7)])
-def test_what_stretches_hold_is_joined_by_clip(lengths):
+def test_rows_of_all_frames_are_parted_by_clip(lengths):
     frames = row_of(*lengths)
-    parts = [np.stack([s.registered, s.registered**2], axis=1) for s in frames.stretches]
-    whole = frames.by_clip(parts)
+    rows = np.concatenate([s.registered for s in frames.stretches] + [[-1, -1]])
+    assert len(frames) == sum(lengths)
+    whole = frames.by_clip(np.stack([rows, rows**2], axis=1))
     assert len(whole) == len(lengths)
     for found, n in zip(whole, lengths, strict=True):
         np.testing.assert_array_equal(found, np.stack([np.arange(n), np.arange(n) ** 2], axis=1))

@@ -37,6 +37,10 @@ def assert_same(a, b, where=""):
         for name in a:
             for one, other in zip(a[name], b[name], strict=True):
                 assert_same(one, other, f".{name}")
+    elif isinstance(a, dict) and where == ".tracked":
+        assert list(a) == list(b)
+        for name in a:
+            assert_same(a[name], b[name], f".{name}")
     elif isinstance(a, np.ndarray):
         assert (a.shape, a.dtype) == (b.shape, b.dtype), where
         np.testing.assert_array_equal(a, b, err_msg=where)
@@ -124,8 +128,11 @@ TENSORS = {
     "singular pose": (lambda t: {"calm.poses": t["calm.poses"] * 0}, "calm.poses"),
     "no background": (
         lambda t: {n: t[n][:0] for n in ("calm.poses", "calm.registered", "calm.correlation")},
-        "background",
+        "calm.poses has no frames",
     ),
+    "a track missing": (lambda t: {"tracked.1.poses": None}, "tracked.1.poses"),
+    "a track cut": (lambda t: {"tracked.1.registered": t["calm.registered"][:1]}, "must be bool"),
+    "a singular track": (lambda t: {"tracked.0.poses": t["calm.poses"] * 0}, "tracked.0.poses"),
     "history of another size": (lambda t: {"beta.training": t["beta.training"][:, 1:]}, "training"),
     "scalar": (lambda t: {"calm.poses": np.float64(3.0)}, ""),
 }  # fmt: skip
@@ -167,6 +174,13 @@ FACTS = {
     "labels less": (lambda f: {"alpha": f["alpha"] | {"labels": ["AA"]}}, "alpha"),
     "constants unknown": (lambda f: {"beta": f["beta"] | {"constants": {"x": 1}}}, ""),
     "calm a number": (lambda f: {"calm": 3}, ""),
+    "tracked a number": (lambda f: {"tracked": 3}, ""),
+    "tracked of a name": (lambda f: {"tracked": [{"clip": "a"}]}, "tracked"),
+    "tracked more": (lambda f: {"tracked": f["tracked"] * 2}, "tracked"),
+    "tracked a residual of text": (
+        lambda f: {"tracked": [one | {"residual": "small"} for one in f["tracked"]]},
+        "tracked",
+    ),
     "suffix a path": (lambda f: {"calm": f["calm"] | {"suffix": "/../../x.mkv"}}, "suffix"),
 }
 

@@ -1,6 +1,6 @@
 """Small worlds for tests: a drawn person who says a few phones, in clips with sound."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from mmmgpu.phonemes import PhonemeModels
 from mmmgpu.regions import region_around
 from mmmgpu.registration import Head
 from mmmgpu.slds import Slds
+from mmmgpu.tracked_clips import TrackedClip
 from mmmgpu.tracks import Reference, Track
 from mmmgpu.trajectory_training import Constants, History, TrainedStream
 from mmmgpu.video_writing import write_video
@@ -180,6 +181,9 @@ def make_model(basis, *, seed=0):
     poses = np.eye(3) + 0.01 * rng.normal(size=(7, 3, 3))
     registered = rng.random(7) > 0.3
     track = Track(poses, registered, rng.random(7), rng.random(3), rng.random(3), 0.125)
+    first = replace(
+        track, poses=poses[:4], registered=registered[:4], correlation=track.correlation[:4]
+    )
     head = Head(
         rng.integers(0, 256, (9, 11), np.uint8), rng.random((9, 11), np.float32), poses[0] * 2
     )
@@ -197,4 +201,8 @@ def make_model(basis, *, seed=0):
         calm=Calm(rng.integers(0, 256, 100, np.uint8), ".mkv", track),
         notes={"skipped": {"a.mkv": "why"}, "seed": 3, "residual": 0.1},
         dynamics={name: (movers[0][name], movers[1][name]) for name in movers[0]},
+        tracked={
+            "b ü.mkv": TrackedClip("ab" * 32, replace(track, residual=0.5)),
+            "a.mkv": TrackedClip("cd" * 32, first),
+        },
     )
