@@ -19,8 +19,6 @@ from mmmgpu.adaptation_folds import METHODS, Adapted, adapt_models
 from mmmgpu.basis import Basis
 from mmmgpu.corpora import Clip, check_rates, open_corpus
 from mmmgpu.corpus_steps import (
-    Frames,
-    Pictures,
     Seen,
     analyse,
     calmest,
@@ -28,7 +26,6 @@ from mmmgpu.corpus_steps import (
     fit_streams,
     look,
     make_model,
-    rebased_frames,
     track_corpus,
     tracking_notes,
     utterances_of,
@@ -36,6 +33,7 @@ from mmmgpu.corpus_steps import (
 from mmmgpu.dynamics import Dynamics
 from mmmgpu.errors import InputError
 from mmmgpu.flows import MATCHERS
+from mmmgpu.frames import Frames, Pictures, rebased_frames
 from mmmgpu.gdlr import RULES, Descent
 from mmmgpu.models import Model
 from mmmgpu.phonemes import PhonemeModels, Utterance, coverage

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from mmmgpu.backends import default_threads
 from mmmgpu.basis import Basis, make_basis
-from mmmgpu.corpus_steps import Frames
 from mmmgpu.flows import best_of, extend_flows, matcher, path_to, shortest_paths
+from mmmgpu.frames import Frames
 from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.progress import progress
 from mmmgpu.regions import Region, mouth_mask

@@ -18,9 +18,9 @@ from mmmgpu.alignments import Alignment
 from mmmgpu.analysis import byte_thumbnail
 from mmmgpu.basis import Basis
 from mmmgpu.corpora import Clip
-from mmmgpu.corpus_steps import Frames
 from mmmgpu.errors import InputError
 from mmmgpu.flows import matcher
+from mmmgpu.frames import Frames
 from mmmgpu.models import Model
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.points import CLOSED, OPEN

@@ -17,19 +17,18 @@ from numpy.typing import NDArray
 
 from mmmgpu.corpora import Clip, check_rates, open_corpus
 from mmmgpu.corpus_steps import (
-    Frames,
     analyse_corpus,
     calmest,
     fit_dynamics,
     fit_streams,
     look,
     make_model,
-    rebased_frames,
     track_corpus,
     tracking_notes,
     utterances_of,
 )
 from mmmgpu.dynamics import Dynamics
+from mmmgpu.frames import Frames, rebased_frames
 from mmmgpu.models import Model
 from mmmgpu.phonemes import Utterance
 from mmmgpu.phones import SIL

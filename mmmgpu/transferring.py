@@ -22,13 +22,10 @@ from mmmgpu.basis import MOUTH, Basis, around, make_basis, part_of, still_outsid
 from mmmgpu.checkpoints import write_step
 from mmmgpu.corpora import Clip, open_corpus
 from mmmgpu.corpus_steps import (
-    Frames,
-    Stretch,
     calmest,
     finished_step,
     for_all,
     make_model,
-    rebased_frames,
     track_corpus,
     tracking_notes,
 )
@@ -36,6 +33,7 @@ from mmmgpu.correspondence import Correspondence, rbf_correspondence
 from mmmgpu.errors import InputError
 from mmmgpu.flow_matching import SMOOTHING, View
 from mmmgpu.flows import Matcher, at_scale, best_flow, best_of, concatenate, matcher
+from mmmgpu.frames import Frames, Stretch, rebased_frames
 from mmmgpu.matching import BALANCE, Matching, match_prototypes
 from mmmgpu.models import Model
 from mmmgpu.parallel import Cancelled, map_ordered

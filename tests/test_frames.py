@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mmmgpu.corpus_steps import Frames, Pictures
+from mmmgpu.frames import Frames, Pictures
 from mmmgpu.regions import Region
 
 
