@@ -31,7 +31,7 @@ from mmmgpu.frames import Frames, Stretch
 from mmmgpu.models import REGULARISED, Calm, Model
 from mmmgpu.parallel import one_thread_each
 from mmmgpu.phonemes import Utterance
-from mmmgpu.processes import Tick, Work, map_out, share_out
+from mmmgpu.processes import Tick, Work, kept_processes, map_out, share_out
 from mmmgpu.progress import progress_bar
 from mmmgpu.regions import Region, mouth_mask
 from mmmgpu.tracks import Reference, Track, track_clip
@@ -53,7 +53,7 @@ def make_model(
     said = [[list(phone) for phone in clip.alignment.phones] for clip in corpus]
     mark = fingerprint([clip.path for clip in corpus], {**given, "said": said})
     folder = open_checkpoints(out.with_name(out.name + ".work"), mark)
-    with one_thread_each():
+    with one_thread_each(), kept_processes():
         model = job(folder)
     model.save(out)
     shutil.rmtree(folder)

@@ -92,8 +92,9 @@ def concatenate(first: F32, second: F32) -> F32:
 
 def explanation_error(reference: F32, image: F32, flow: F32, mask: F32) -> float:
     """How badly `flow` explains `image`: mean squared difference of the pulled image, weighted."""
-    miss = ((pull(image, flow) - reference) ** 2).mean(axis=-1)
-    return float((mask * miss).sum() / mask.sum())
+    missed = (pull(image, flow) - reference) ** 2
+    by_colour = mask.ravel() @ missed.reshape(mask.size, -1)
+    return float(by_colour.mean() / mask.sum())
 
 
 def best_flow(

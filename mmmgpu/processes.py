@@ -1,9 +1,9 @@
 """Work shared out to Python processes, for long jobs that the interpreter lock would hold up.
 
 Unlike `multiprocessing`, calling scripts need no ``if __name__ == "__main__"``: a child is a plain
-``python -m mmmgpu.processes`` that is told over its standard input what to do and answers with one
-byte for every piece of work done. Results go to files: finished steps (see `mmmgpu.checkpoints`),
-or with `map_out` such as nobody else sees.
+``python -m mmmgpu.processes`` that is told over its standard input what to do, once or again and
+again, and answers with one byte for every piece of work done. Results go to files: finished steps
+(see `mmmgpu.checkpoints`), or with `map_out` such as nobody else sees.
 """
 
 import os
@@ -11,7 +11,9 @@ import pickle
 import selectors
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -20,13 +22,28 @@ from mmmgpu.errors import InputError
 
 Tick = Callable[[], None]
 Work = Callable[[Any, Tick], None]
+Job = tuple[Callable[[Any], Work], Any, list[Any]]  # prepare, shared and items of `share_out`
+Child = subprocess.Popen[bytes]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 ONE_THREAD = dict.fromkeys(
     ("MMMGPU_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT"), "1"
 )
-DONE, FAILED = b".", b"!"
+DONE, FAILED, READY = b".", b"!", b"\n"  # READY: for more work
+_IDLE: ContextVar[list[Child] | None] = ContextVar("idle", default=None)  # None: keep no child
+
+
+@contextmanager
+def kept_processes() -> Iterator[None]:
+    """Inside, children that have done their work are given more, and no others started."""
+    idle: list[Child] = []
+    token = _IDLE.set(idle)
+    try:
+        yield
+    finally:
+        _IDLE.reset(token)
+        _dismiss(idle)
 
 
 def share_out(
@@ -51,14 +68,22 @@ def share_out(
         InputError: Raised in a process; the others are stopped.
         RuntimeError: A process died.
     """
-    count = min(processes, len(items))
-    children = [_start(prepare, shared, items[i::count]) for i in range(count)]
+    count, idle = min(processes, len(items)), _IDLE.get()
+    children: list[Child] = []
     try:
+        for i in range(count):
+            children.append(idle.pop() if idle else _start())
+            _tell(children[-1], (prepare, shared, list(items[i::count])))
         _watch(children, advance)
-    finally:
+    except BaseException:
         for child in children:
             child.kill()
             child.communicate()
+        raise
+    if idle is None:
+        _dismiss(children)
+    else:
+        idle += children
 
 
 def map_out(
@@ -92,23 +117,29 @@ def _kept(folder: str, i: int) -> Path:
     return Path(folder, f"{i}.pickle")
 
 
-def _start(
-    prepare: Callable[[Any], Work], shared: Any, items: Sequence[Any]
-) -> subprocess.Popen[bytes]:
-    child = subprocess.Popen(
+def _start() -> Child:
+    return subprocess.Popen(
         [sys.executable, "-m", "mmmgpu.processes"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, **ONE_THREAD, **_same_modules()},
         start_new_session=True,  # Ctrl-C is the parent's business, which ends its children
     )
+
+
+def _tell(child: Child, job: Job) -> None:
     assert child.stdin is not None
     try:
-        pickle.dump((prepare, shared, list(items)), child.stdin)
+        pickle.dump(job, child.stdin)
         child.stdin.flush()
     except BrokenPipeError:
         pass  # it died at once; `_watch` says so
-    return child
+
+
+def _dismiss(children: Iterable[Child]) -> None:
+    """Tell them that there is no more work, and wait until they have ended."""
+    for child in children:
+        child.communicate()
 
 
 def _same_modules() -> dict[str, str]:
@@ -116,7 +147,8 @@ def _same_modules() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "PYTHONSAFEPATH": "1"}
 
 
-def _watch(children: Sequence[subprocess.Popen[bytes]], advance: Callable[[int], None]) -> None:
+def _watch(children: Sequence[Child], advance: Callable[[int], None]) -> None:
+    """Until all are ready for more work."""
     with selectors.DefaultSelector() as pipes:
         for child in children:
             assert child.stdout is not None
@@ -125,32 +157,42 @@ def _watch(children: Sequence[subprocess.Popen[bytes]], advance: Callable[[int],
             for key, _ in pipes.select():
                 answer = os.read(key.fd, 4096)
                 if not answer:
-                    pipes.unregister(key.fileobj)
-                    if key.data.wait() != 0:
-                        raise RuntimeError(f"a worker process ended with {key.data.returncode}")
-                elif FAILED in answer:
+                    raise RuntimeError(f"a worker process ended with {key.data.wait()}")
+                if FAILED in answer:
                     message = answer[answer.index(FAILED) + 1 :] + key.data.stdout.read()
                     raise InputError(message.decode())
-                else:
+                if answer.endswith(READY):
+                    pipes.unregister(key.fileobj)
+                if DONE in answer:
                     advance(answer.count(DONE))
 
 
 def main() -> None:
-    """Do what the parent says on standard input."""
-    answers = os.fdopen(os.dup(1), "wb", buffering=0)
+    """Do what the parent says on standard input, until it says no more."""
+    jobs, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # whatever a library prints must not pass for an answer
-    try:
-        prepare, shared, items = pickle.load(sys.stdin.buffer)
-        from mmmgpu.parallel import one_thread_each
 
-        with one_thread_each():
-            work = prepare(shared)
-            for item in items:
-                work(item, lambda: answers.write(DONE) and None)
+    def tick() -> None:
+        answers.write(DONE)
+
+    try:
+        while jobs.peek(1):
+            _do(pickle.load(jobs), tick)
+            answers.write(READY)
     except InputError as e:
         answers.write(FAILED + str(e).encode())
     except (BrokenPipeError, EOFError, pickle.UnpicklingError):
         sys.exit(1)  # the parent is gone
+
+
+def _do(job: Job, tick: Tick) -> None:
+    from mmmgpu.parallel import one_thread_each
+
+    prepare, shared, items = job
+    with one_thread_each():
+        work = prepare(shared)
+        for item in items:
+            work(item, tick)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mmmgpu.errors import InputError
-from mmmgpu.processes import map_out, share_out
+from mmmgpu.processes import kept_processes, map_out, share_out
 
 WAIT_S = 60  # at most, for another process
 
@@ -93,13 +93,10 @@ def test_nothing_to_do_starts_nothing(tmp_path):
 def has_ended(folder):
     """Whether the process of the endless item is gone; it is ended where it is not."""
     pid = int((folder / "pid").read_text())
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
+    ended = gone(pid)
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, 9)
-    return False
+    return ended
 
 
 @pytest.mark.parametrize(
@@ -134,6 +131,55 @@ def test_results_come_back_whole_and_in_order(processes, used):
     assert len(pids) == used
     assert os.getpid() not in pids
     assert sum(ticks) == 4
+
+
+def tell(item, tick):
+    return os.getpid()
+
+
+def gone(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def test_kept_processes_do_one_job_after_another():
+    def pids(count):
+        return map_out(tell, range(count), processes=2, advance=lambda n: None)
+
+    with kept_processes():
+        first, second, third = pids(1), pids(5), pids(2)
+        assert set(first) < set(second) == set(third)
+        assert not any(map(gone, second))
+    assert all(map(gone, second))
+    assert set(pids(2)).isdisjoint(second)
+    assert len(set(pids(1) + pids(1))) == 2
+
+
+def test_kept_processes_take_large_jobs():
+    large = np.arange(300_000.0)
+    with kept_processes():
+        for i in range(3):
+            found = map_out(partial(powers, i), [large % 3], processes=1, advance=lambda n: None)
+            np.testing.assert_array_equal(found[0][0], float(i) ** (large % 3))
+
+
+@pytest.mark.parametrize("fail", [refuse, die])
+def test_a_process_that_fails_is_not_kept(tmp_path, fail):
+    order = ("failing", "endless")
+    with kept_processes():
+        old = map_out(tell, [1, 2], processes=2, advance=lambda n: None)
+        with pytest.raises((InputError, RuntimeError), match=r"odd|ended with 7"):
+            share_out(
+                partial(failing, fail), str(tmp_path), order, processes=2, advance=lambda n: None
+            )
+        assert has_ended(tmp_path)
+        assert all(map(gone, old))
+        new = map_out(tell, [1, 2], processes=2, advance=lambda n: None)
+        assert set(new).isdisjoint(old)
+    assert all(map(gone, new))
 
 
 def refusing(item, tick):
