@@ -26,14 +26,16 @@ either of them, the flows from there say little.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.backends import Backend, get_backend
+from mmmgpu.backends import Backend, default_threads, get_backend
 from mmmgpu.basis import LIP, Basis
 from mmmgpu.correspondence import Correspondence
+from mmmgpu.parallel import Cancelled, map_ordered
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -203,9 +205,15 @@ def synthetic_flows(
     for r, v in enumerate(views):
         mine = np.flatnonzero(view == r)
         p = v.correspondence.inverse(q)
-        at = p.astype(np.float32)
-        for k in mine:
-            moved = cv2.remap(v.flows_a[k], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-            flows[k] = v.correspondence(p + moved) - q
+        carry = partial(_carried, v.correspondence, q, p)
+        carried = map_ordered(carry, v.flows_a[mine], threads=default_threads())
+        for k, flow in zip(mine, carried, strict=True):
+            flows[k] = flow
         flows[mine] = calibrated(flows[mine], v.flows_b, calibration, r, mine)
     return flows
+
+
+def _carried(s: Correspondence, q: Numbers, p: Floats, flow: F32, _: Cancelled) -> Floats:
+    """S(p + C(p)) - q for points q = S(p) of B, (h', w', 2), and a flow C on A's pixels."""
+    at = p.astype(np.float32)
+    return s(p + cv2.remap(flow, at[..., 0], at[..., 1], cv2.INTER_LINEAR)) - q

@@ -14,6 +14,7 @@ edges of teeth and lips are sharper than that, they would count as different tex
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -202,6 +203,7 @@ class _TextureScan:
         self._flows, self._beta = planes(flows), np.where(beta > NO_TEXTURE, beta, 0)
         self._pixels = np.flatnonzero(target.w_t > MOUTH)
         weight = target.w_t.ravel()[self._pixels]
+        self._held: list[list[tuple[Numbers, Any]]] = [[] for _ in views]
         frames = np.stack([self._seen(image) for image in target.images])
         self._frames, self._weight = map(self._kernels.to_device, (frames, weight / weight.sum()))
 
@@ -225,15 +227,25 @@ class _TextureScan:
 
         A frame that is the candidate of several prototypes is warped once.
         """
-        k, beta = self._kernels, self._beta[:, mine]
-        used = np.flatnonzero(beta.any(axis=1))
-        frames, which = np.unique(candidates[used], return_inverse=True)
-        weights = np.zeros((len(frames), len(mine)))
-        np.add.at(weights, which, beta[used])
-        images, flows = self._target.images[frames], self._views[r].flows_b[frames]
-        height, width = self._target.w_t.shape
-        everywhere = np.ones((height, self._flows.shape[-1]), np.float32)
-        given = self._flows[mine], weights.T.astype(np.float32, order="C"), everywhere
-        held = k.hold_prototypes(images, flows, HOLE)
-        made = k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
+        k, flows = self._kernels, self._flows[mine]
+        weights = np.zeros((len(mine), len(self._target.images)), np.float32)
+        np.add.at(weights.T, candidates, self._beta[:, mine])
+        made = np.zeros((len(mine), 3, *flows.shape[2:]), np.float32)
+        everywhere = k.to_device(np.ones(flows.shape[2:], np.float32))
+        for frames, held in self._hold(r, np.flatnonzero(weights.any(axis=0))):
+            shares = weights[:, frames]
+            some = np.flatnonzero(shares.any(axis=1))
+            moved, mixed = map(k.to_device, (flows[some], shares[some]))
+            part: F32 = k.to_host(k.mix_prototypes(held, moved, mixed, everywhere))
+            made[some] += part
+        width = self._target.w_t.shape[1]
         return np.stack([self._seen(picture(one, width)) for one in made])
+
+    def _hold(self, r: int, frames: Numbers) -> list[tuple[Numbers, Any]]:
+        """Frames held for view r, `frames` (n,) among them: most were candidates before."""
+        parts = self._held[r]
+        new = np.setdiff1d(frames, np.concatenate([frames[:0], *(part for part, _ in parts)]))
+        if len(new):
+            given = self._target.images[new], self._views[r].flows_b[new]
+            parts.append((new, self._kernels.hold_prototypes(*given, HOLE)))
+        return parts
