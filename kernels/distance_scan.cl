@@ -2,8 +2,8 @@
  *
  * `pack` lays the channels of each field out as planes padded to whole vectors; `distance_scan`
  * walks them 16 points at a time, in float within a block and in double from block to block. Two
- * queries and two rows of the corpus share their loads. PoCL 3.0 aborts the process on a sqrt of 16
- * floats, and it would be slower than `root`.
+ * queries and four rows of the corpus share their loads. The processor's unit for roots works beside
+ * those for sums and products: it gets the first eight of 16 points, `root` has the others.
  */
 
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
@@ -11,6 +11,9 @@
 #define LANES 16
 #define MAGIC 0x5f200000
 #define BLOCK 16 /* vectors summed in float */
+#define QUERIES 2
+#define ROWS 4
+#define PAIRS (QUERIES * ROWS)
 
 /* 16 flows anywhere. */
 typedef float float32u __attribute__((ext_vector_type(32), aligned(4)));
@@ -71,11 +74,20 @@ float16 root(const float16 x)
     return xy * (2.45213665f + t * (-3.07998830f + t * (2.31981536f + t * -0.692957570f)));
 }
 
-double sum(const float16 part)
+/* The same by the processor. As functions of single numbers the compiler makes vectors of them; PoCL
+ * 3.0 calls its own for vectors, and aborts the process where they have 16.
+ */
+float8 exact_root(const float8 x)
 {
-    const float8 b = part.lo + part.hi;
-    const double4 a = convert_double4(b.lo) + convert_double4(b.hi);
-    return (a.s0 + a.s1) + (a.s2 + a.s3);
+    return (float8)(
+        __builtin_sqrtf(x.s0), __builtin_sqrtf(x.s1), __builtin_sqrtf(x.s2), __builtin_sqrtf(x.s3),
+        __builtin_sqrtf(x.s4), __builtin_sqrtf(x.s5), __builtin_sqrtf(x.s6), __builtin_sqrtf(x.s7));
+}
+
+double sum(const float8 part)
+{
+    const float4 a = part.lo + part.hi;
+    return ((double)a.s0 + (double)a.s1) + ((double)a.s2 + (double)a.s3);
 }
 
 __kernel void distance_scan(
@@ -96,42 +108,44 @@ __kernel void distance_scan(
     const int tid = get_global_id(0);
     if (tid >= count)
         return;
-    const int pairs = (number + 1) / 2;
-    const int k0 = 2 * ((first + tid) % pairs);
-    const int k1 = min(k0 + 1, number - 1); /* of an odd number the last is done twice */
-    const int n0 = 2 * ((first + tid) / pairs);
-    const int n1 = min(n0 + 1, tile - 1);
+    const int groups = (number + QUERIES - 1) / QUERIES;
     const int row = channels * vectors;
-    double4 total = (double4)(0.0);
+    int k[QUERIES]; /* what is beyond the last is the last again */
+    int n[ROWS];
+#pragma unroll
+    for (int j = 0; j < QUERIES; ++j)
+        k[j] = min(QUERIES * ((first + tid) % groups) + j, number - 1);
+#pragma unroll
+    for (int j = 0; j < ROWS; ++j)
+        n[j] = min(ROWS * ((first + tid) / groups) + j, tile - 1);
+    double total[PAIRS] = {0.0};
     for (int begin = 0; begin < vectors; begin += BLOCK) {
-        float16 part00 = (float16)(0.0f);
-        float16 part01 = (float16)(0.0f);
-        float16 part10 = (float16)(0.0f);
-        float16 part11 = (float16)(0.0f);
-        for (int v = begin; v < min(begin + BLOCK, vectors); ++v) {
-            float16 norm00 = (float16)(0.0f);
-            float16 norm01 = (float16)(0.0f);
-            float16 norm10 = (float16)(0.0f);
-            float16 norm11 = (float16)(0.0f);
-            for (int i = v; i < row; i += vectors) {
-                const float16 q0 = queries[k0 * row + i];
-                const float16 q1 = queries[k1 * row + i];
-                const float16 f0 = planes[n0 * row + i];
-                const float16 f1 = planes[n1 * row + i];
-                norm00 += (q0 - f0) * (q0 - f0);
-                norm01 += (q0 - f1) * (q0 - f1);
-                norm10 += (q1 - f0) * (q1 - f0);
-                norm11 += (q1 - f1) * (q1 - f1);
+        const int end = begin + BLOCK < vectors ? begin + BLOCK : vectors;
+        float16 part[PAIRS] = {(float16)(0.0f)}; /* of two pairs: the first eight points, the others */
+        for (int v = begin; v < end; ++v) {
+            float16 norm[PAIRS] = {(float16)(0.0f)};
+            for (int i = v; i < row; i += vectors)
+#pragma unroll
+                for (int j = 0; j < PAIRS; ++j) {
+                    const float16 d = queries[k[j / ROWS] * row + i] - planes[n[j % ROWS] * row + i];
+                    norm[j] += d * d;
+                }
+            const float16 w = weights[v];
+#pragma unroll
+            for (int j = 0; j < PAIRS; j += 2) {
+                const float16 exact = (float16)(exact_root(norm[j].lo), exact_root(norm[j + 1].lo));
+                part[j] += (float16)(w.lo, w.lo) * exact;
+                part[j + 1] += (float16)(w.hi, w.hi) * root((float16)(norm[j].hi, norm[j + 1].hi));
             }
-            part00 += weights[v] * root(norm00);
-            part01 += weights[v] * root(norm01);
-            part10 += weights[v] * root(norm10);
-            part11 += weights[v] * root(norm11);
         }
-        total += (double4)(sum(part00), sum(part01), sum(part10), sum(part11));
+#pragma unroll
+        for (int j = 0; j < PAIRS; j += 2) {
+            const float16 both = part[j] + part[j + 1];
+            total[j] += sum(both.lo);
+            total[j + 1] += sum(both.hi);
+        }
     }
-    distance[k0 * corpus + start + n0] = (float)total.s0;
-    distance[k0 * corpus + start + n1] = (float)total.s1;
-    distance[k1 * corpus + start + n0] = (float)total.s2;
-    distance[k1 * corpus + start + n1] = (float)total.s3;
+#pragma unroll
+    for (int j = 0; j < PAIRS; ++j)
+        distance[k[j / ROWS] * corpus + start + n[j % ROWS]] = (float)total[j];
 }

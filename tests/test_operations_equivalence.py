@@ -234,6 +234,14 @@ def test_distance_scan(backend, points, queries, rows, channels):
     assert_close(actual, operations.distance_scan(q, c, w, backend="numpy"))
 
 
+def test_distances_do_not_depend_on_where_the_fields_stand(backend):
+    """Equal fields are equally far, to the bit: which comes first may decide between them."""
+    query, row = np.random.default_rng(0).random((2, 1, 100, 2))
+    several = np.repeat(query, 5, axis=0), np.repeat(row, 71, axis=0)
+    distance = operations.distance_scan(*several, np.ones(100), backend=backend)
+    assert_array_equal(distance, np.full((5, 71), distance[0, 0]))
+
+
 def test_distance_scan_of_large_equal_residuals(backend):
     """Adding one number many times is where a float32 sum drifts most."""
     queries, corpus = np.full((1, 720 * 576, 2), 0.3), np.zeros((2, 720 * 576, 2))

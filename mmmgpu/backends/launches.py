@@ -26,6 +26,7 @@ WHITE = 65535  # of a texture, as in kernels/prototypes
 MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
 TOGETHER = 4, 2, 1  # mixtures whose flows are re-oriented at once: as many as there are enough of
 TILE = 64  # corpus rows packed at a time
+QUERIES, ROWS = 2, 4  # of one thread of kernels/distance_scan
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class Launches(ABC):
         packed = self._packed(queries, points, channels, 0, number)
         shares = self._packed(weights, points, 1, 0, 1)
         distance = self.empty(number, rows)
-        pairs = math.ceil(number / 2)
+        groups = math.ceil(number / QUERIES)
 
         def scan(first: int, count: int) -> None:
             for start in range(first, first + count, TILE):
@@ -168,7 +169,7 @@ class Launches(ABC):
                 planes = self._packed(corpus, points, channels, start, tile)
                 sizes = [number, rows, start, tile, math.ceil(points / LANES), channels]
                 inputs = [packed, planes, shares, *sizes]
-                blocks = pairs * math.ceil(tile / 2)
+                blocks = groups * math.ceil(tile / ROWS)
                 self.launch("distance_scan.distance_scan", 0, blocks, inputs, [distance])
 
         self.split(rows, scan)
