@@ -1,19 +1,24 @@
 """The frames of tracked clips as one numbered row, or in stretches, one for a process at a time."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mmmgpu.backends import default_threads
 from mmmgpu.corpora import Clip
 from mmmgpu.errors import InputError
+from mmmgpu.parallel import Cancelled, map_ordered
 from mmmgpu.regions import Region
 from mmmgpu.tracks import Track, crop, crops, rebase
 from mmmgpu.videos import read_chosen_frames
 
 Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
+T = TypeVar("T")
 
 STRETCHES = 8  # at least, of a corpus: to decode up to one costs little beside analysing it
 
@@ -104,7 +109,7 @@ class Frames:
     ) -> tuple[NDArray[np.uint8], tuple[tuple[str, int], ...]]:
         """Some frames in full, (n, H, W, 3), and the clip name and frame number of each."""
         wanted = [int(i) for i in numbers]
-        found = {i: (frame, (clip.name, t)) for i, clip, t, frame in self._read(wanted)}
+        found = self._read(wanted, lambda frame, clip, t: (frame, (clip.name, t)))
         whole, places = zip(*(found[i] for i in wanted), strict=True)
         return np.stack(whole), places
 
@@ -119,21 +124,33 @@ class Frames:
 
     def crops(self, numbers: Iterable[int], region: Region) -> dict[int, F32]:
         """The regions of some frames, by number, rising."""
-        return {
-            i: crop(frame, self.tracks[clip.name].poses[t], self.tracks[clip.name], region)
-            for i, clip, t, frame in self._read(numbers)
-        }
 
-    def _read(self, numbers: Iterable[int]) -> Iterator[tuple[int, Clip, int, NDArray[np.uint8]]]:
-        """Some frames in full, rising, with number, clip and place in it; a clip is read once."""
+        def take(frame: NDArray[np.uint8], clip: Clip, t: int) -> F32:
+            track = self.tracks[clip.name]
+            return crop(frame, track.poses[t], track, region)
+
+        return self._read(numbers, take)
+
+    def _read(
+        self, numbers: Iterable[int], take: Callable[[NDArray[np.uint8], Clip, int], T]
+    ) -> dict[int, T]:
+        """What is taken of some frames, by number, rising; a clip is read once, some at a time.
+
+        take: Given a frame in full, its clip and its place in it.
+        """
         wanted = np.unique(np.fromiter(numbers, np.int64))
-        first = 0
-        for clip in self.clips:
-            own = wanted[(first <= wanted) & (wanted < first + clip.length)] - first
-            if len(own):
-                for t, frame in zip(own.tolist(), read_chosen_frames(clip.path, own), strict=True):
-                    yield first + t, clip, t, frame
-            first += clip.length
+        ends = np.cumsum([clip.length for clip in self.clips])
+        parts = np.split(wanted, np.searchsorted(wanted, ends))[:-1]
+        jobs = [job for job in zip(self.clips, ends, parts, strict=True) if len(job[2])]
+
+        def read(job: tuple[Clip, int, NDArray[np.int64]], _: Cancelled) -> list[T]:
+            clip, end, own = job
+            places = own - (end - clip.length)
+            seen = zip(read_chosen_frames(clip.path, places), places.tolist(), strict=True)
+            return [take(frame, clip, t) for frame, t in seen]
+
+        found = map_ordered(read, jobs, threads=default_threads())
+        return dict(zip(wanted.tolist(), chain.from_iterable(found), strict=True))
 
 
 def rebased_frames(frames: Frames, name: str, t: int) -> Frames:
