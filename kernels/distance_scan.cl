@@ -74,14 +74,20 @@ float16 root(const float16 x)
     return xy * (2.45213665f + t * (-3.07998830f + t * (2.31981536f + t * -0.692957570f)));
 }
 
+#if __has_builtin(__builtin_sqrtf)
+#define ROOT __builtin_sqrtf
+#else
+#define ROOT sqrt
+#endif
+
 /* The same by the processor. As functions of single numbers the compiler makes vectors of them; PoCL
  * 3.0 calls its own for vectors, and aborts the process where they have 16.
  */
 float8 exact_root(const float8 x)
 {
     return (float8)(
-        __builtin_sqrtf(x.s0), __builtin_sqrtf(x.s1), __builtin_sqrtf(x.s2), __builtin_sqrtf(x.s3),
-        __builtin_sqrtf(x.s4), __builtin_sqrtf(x.s5), __builtin_sqrtf(x.s6), __builtin_sqrtf(x.s7));
+        ROOT(x.s0), ROOT(x.s1), ROOT(x.s2), ROOT(x.s3), ROOT(x.s4), ROOT(x.s5), ROOT(x.s6),
+        ROOT(x.s7));
 }
 
 double sum(const float8 part)

@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 LANES = 16
 BLOCK = wp.constant(16)  # vectors summed in float32
-ROWS = wp.constant(4)  # of a thread, two at a time
+QUERIES, ROWS = wp.constant(2), wp.constant(4)  # of a thread, two rows at a time
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec32 = wp.types.vector(length=2 * LANES, dtype=wp.float32)
 
@@ -93,8 +93,8 @@ def distance_scan(
     tid = wp.tid()
     if tid >= count:
         return
-    groups = (number + 1) / 2
-    k0 = 2 * ((first + tid) % groups)
+    groups = (number + QUERIES - 1) / QUERIES
+    k0 = QUERIES * ((first + tid) % groups)
     k1 = wp.min(k0 + 1, number - 1)  # of an odd number the last is done twice
     begin_row = ROWS * ((first + tid) / groups)
     row = channels * vectors

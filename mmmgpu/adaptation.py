@@ -5,8 +5,9 @@ B's clips, and the phoneme models are carried into their coordinates (Eq. 11-13,
 Then the means are adapted to B's own trajectories, class by class (Eq. 14-17, `adaptation_folds`).
 """
 
+import hashlib
 import os
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,7 @@ from mmmgpu.prototypes import choose_prototypes, principal_coordinates
 from mmmgpu.regression_classes import Classes, broad_classes, kmeans_classes, paper_classes
 from mmmgpu.reselection import COVARIANCES, carry
 from mmmgpu.tracked_clips import kept_tracks, known_tracks
+from mmmgpu.tracks import Track
 from mmmgpu.trajectories import scaled_smoothness
 from mmmgpu.trajectory_training import History, TrainedStream
 
@@ -122,6 +124,7 @@ def adapt(
         "box": list(model.basis.region.box),
         "sources": [list(place) for place in model.sources],
         "tracked": {name: clip.sha256 for name, clip in model.tracked.items()},
+        "face": _face(model),
         "adapt": 1,
     }
     return make_model(
@@ -130,6 +133,16 @@ def adapt(
         given,
         lambda folder: _Adaptation(model, corpus, options, backend, folder).run(),
     )
+
+
+def _face(model: Model) -> str:
+    """Hash of the numbers in `model` that steps depend on."""
+    digest, basis = hashlib.sha256(), model.basis
+    tracks = [clip.track for clip in model.tracked.values()]
+    seen = [part for t in tracks for part in (t.poses, t.registered, t.gain, t.offset)]
+    for array in (basis.images, basis.w_f, basis.w_t, model.reference.head.to_frame, *seen):
+        digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 def _check_options(options: AdaptOptions) -> None:
@@ -187,7 +200,7 @@ class _Adaptation:
         coordinates = principal_coordinates(look(self.folder, tracked, model.basis.region))
         frames = rebased_frames(tracked, *model.sources[model.basis.reference])
         chosen, basis = self._reselect(frames, coordinates)
-        to_new, analysed = self._analyse(frames, basis, frozenset(known))
+        to_new, analysed = self._analyse(frames, basis, known)
         weights = flow_weights(basis), texture_weights(basis, backend=self.backend)
         starts = [
             _Start(_carried(old, matrix, options.covariance), utterances_of(frames, z), seen)
@@ -235,7 +248,7 @@ class _Adaptation:
         return chosen, replace(basis, w_f=self.model.basis.w_f, w_t=self.model.basis.w_t)
 
     def _analyse(
-        self, frames: Frames, basis: Basis, known: Set[str]
+        self, frames: Frames, basis: Basis, known: Mapping[str, Track]
     ) -> tuple[tuple[Floats, Floats], tuple[list[Floats], list[Floats]]]:
         """The old prototypes and the clips in the new ones.
 

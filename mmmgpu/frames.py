@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from mmmgpu.backends import default_threads
 from mmmgpu.corpora import Clip
 from mmmgpu.errors import InputError
-from mmmgpu.parallel import Cancelled, map_ordered
+from mmmgpu.parallel import Cancelled, CancelledError, map_ordered
 from mmmgpu.regions import Region
 from mmmgpu.tracks import Track, crop, crops, rebase
 from mmmgpu.videos import read_chosen_frames
 
 Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
+S = TypeVar("S", bound=np.generic)
 T = TypeVar("T")
 
 STRETCHES = 8  # at least, of a corpus: to decode up to one costs little beside analysing it
@@ -100,7 +101,7 @@ class Frames:
         track = self.tracks[clip.name]
         return [Stretch(clip, track, *ends[part : part + 2]) for part in range(parts)]
 
-    def by_clip(self, rows: Floats) -> list[Floats]:
+    def by_clip(self, rows: NDArray[S]) -> list[NDArray[S]]:
         """Rows of all frames, and others behind them, (N, d) -> (T, d) of every clip."""
         return np.split(rows, np.cumsum([clip.length for clip in self.clips]))[:-1]
 
@@ -143,11 +144,14 @@ class Frames:
         parts = np.split(wanted, np.searchsorted(wanted, ends))[:-1]
         jobs = [job for job in zip(self.clips, ends, parts, strict=True) if len(job[2])]
 
-        def read(job: tuple[Clip, int, NDArray[np.int64]], _: Cancelled) -> list[T]:
+        def read(job: tuple[Clip, int, NDArray[np.int64]], cancelled: Cancelled) -> list[T]:
             clip, end, own = job
-            places = own - (end - clip.length)
-            seen = zip(read_chosen_frames(clip.path, places), places.tolist(), strict=True)
-            return [take(frame, clip, t) for frame, t in seen]
+            places, taken = own - (end - clip.length), []
+            for t, frame in zip(places, read_chosen_frames(clip.path, places), strict=True):
+                if cancelled():
+                    raise CancelledError
+                taken.append(take(frame, clip, int(t)))
+            return taken
 
         found = map_ordered(read, jobs, threads=default_threads())
         return dict(zip(wanted.tolist(), chain.from_iterable(found), strict=True))

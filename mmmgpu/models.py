@@ -55,7 +55,7 @@ class Model:
     alternatives: by name, the means (P, M - 1) and (P, M) that other ways of adaptation gave, for
         comparison; all else of the phoneme models is that of the trained ones.
     dynamics: by name (`mmmgpu.dynamics.MODELS`), other models of alpha and of beta.
-    tracked: by name, the clips that a transferred face was taken from.
+    tracked: by name, the clips of a transfer or an adaptation, and their tracks.
     """
 
     basis: Basis

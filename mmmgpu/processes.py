@@ -31,12 +31,17 @@ ONE_THREAD = dict.fromkeys(
     ("MMMGPU_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT"), "1"
 )
 DONE, FAILED, READY = b".", b"!", b"\n"  # READY: for more work
-_IDLE: ContextVar[list[Child] | None] = ContextVar("idle", default=None)  # None: keep no child
+# Children to be given more work; None: none are kept. Not an argument: every job would hand it down
+# through all of its steps, only to start less often.
+_IDLE: ContextVar[list[Child] | None] = ContextVar("idle", default=None)
 
 
 @contextmanager
 def kept_processes() -> Iterator[None]:
-    """Inside, children that have done their work are given more, and no others started."""
+    """Inside, children that have done their work are given more; they keep what memory they have.
+
+    Others are started only where these are too few.
+    """
     idle: list[Child] = []
     token = _IDLE.set(idle)
     try:
@@ -72,7 +77,7 @@ def share_out(
     children: list[Child] = []
     try:
         for i in range(count):
-            children.append(idle.pop() if idle else _start())
+            children.append(_ready_one(idle or []) or _start())
             _tell(children[-1], (prepare, shared, list(items[i::count])))
         _watch(children, advance)
     except BaseException:
@@ -115,6 +120,16 @@ def _keeping(shared: tuple[Callable[[Any, Tick], Any], str]) -> Work:
 
 def _kept(folder: str, i: int) -> Path:
     return Path(folder, f"{i}.pickle")
+
+
+def _ready_one(idle: list[Child]) -> Child | None:
+    """One of `idle`, which it leaves, and those that have died."""
+    while idle:
+        child = idle.pop()
+        if child.poll() is None:
+            return child
+        child.communicate()
+    return None
 
 
 def _start() -> Child:

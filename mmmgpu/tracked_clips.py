@@ -29,7 +29,12 @@ def kept_tracks(clips: Sequence[Clip], tracks: Mapping[str, Track]) -> dict[str,
 
 def known_tracks(clips: Sequence[Clip], kept: Mapping[str, TrackedClip]) -> dict[str, Track]:
     """The tracks of those of `clips` that are `kept` under their names, and still the same."""
-    met = [c for c in clips if c.name in kept and kept[c.name].sha256 == _digest(c.path)]
+
+    def is_same(clip: Clip, old: TrackedClip) -> bool:
+        """Also read as so many frames, which is a matter of versions."""
+        return old.sha256 == _digest(clip.path) and len(old.track) == clip.length
+
+    met = [c for c in clips if c.name in kept and is_same(c, kept[c.name])]
     return {c.name: kept[c.name].track for c in met}
 
 

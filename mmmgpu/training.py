@@ -90,7 +90,7 @@ def train(
     check_rates(corpus)
     if options.region is None:
         check_sound(corpus)
-    given = {"options": vars(options), "steps": 1}
+    given = {"options": vars(options), "steps": 2}
     return make_model(
         out, corpus, given, lambda folder: _Training(corpus, options, backend, folder).run()
     )

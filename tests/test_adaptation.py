@@ -6,7 +6,7 @@ import pytest
 from pairs import interrupt_second_step
 
 from mmmgpu import corpus_steps
-from mmmgpu.adaptation import OTHER_STEP, AdaptOptions, adapt
+from mmmgpu.adaptation import OTHER_STEP, AdaptOptions, _face, adapt
 from mmmgpu.adaptation_folds import METHODS
 from mmmgpu.alignments import Alignment, cover, read_alignment, write_textgrid
 from mmmgpu.corpora import open_corpus
@@ -150,6 +150,21 @@ def test_clips_known_from_transfer_are_neither_tracked_nor_analysed_again(
     assert done["track"] == [clip.name for clip in clips[1:]]
     assert done["analysis"][-2:] == ["prototypes-0", "prototypes-1"]
     assert out.read_bytes() == adapted[0].read_bytes()
+
+
+def test_steps_are_not_taken_up_for_another_face(before):
+    basis, head = before.basis, before.reference.head
+    name, clip = next(iter(before.tracked.items()))
+    moved = replace(clip, track=replace(clip.track, poses=clip.track.poses + 1e-9))
+    others = [
+        replace(before, basis=replace(basis, images=basis.images[::-1])),
+        replace(before, basis=replace(basis, w_t=basis.w_t / 2)),
+        replace(
+            before, reference=replace(before.reference, head=replace(head, to_frame=np.eye(3)))
+        ),
+        replace(before, tracked=before.tracked | {name: moved}),
+    ]
+    assert len({_face(model) for model in (before, replace(before, notes={}), *others)}) == 5
 
 
 def test_an_interrupted_adaptation_continues_to_the_same_bytes(

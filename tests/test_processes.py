@@ -1,5 +1,6 @@
 import contextlib
 import os
+import signal
 import tempfile
 import time
 from functools import partial
@@ -156,6 +157,16 @@ def test_kept_processes_do_one_job_after_another():
     assert all(map(gone, second))
     assert set(pids(2)).isdisjoint(second)
     assert len(set(pids(1) + pids(1))) == 2
+
+
+def test_a_kept_process_that_has_died_is_replaced():
+    with kept_processes():
+        first = map_out(tell, [1, 2], processes=2, advance=lambda n: None)
+        os.kill(first[0], signal.SIGKILL)
+        os.waitid(os.P_PID, first[0], os.WEXITED | os.WNOWAIT)
+        second = map_out(tell, [1, 2], processes=2, advance=lambda n: None)
+        assert first[1] in second
+        assert first[0] not in second
 
 
 def test_kept_processes_take_large_jobs():

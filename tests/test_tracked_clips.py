@@ -10,16 +10,17 @@ from mmmgpu.tracks import Track
 @dataclass(frozen=True)
 class File:
     path: Path
+    length: int
 
     @property
     def name(self):
         return self.path.name
 
 
-def file(path, content):
+def file(path, content, *, length=1):
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
-    return File(path)
+    return File(path, length)
 
 
 def test_clips_are_known_by_name_and_content(tmp_path):
@@ -33,3 +34,5 @@ def test_clips_are_known_by_name_and_content(tmp_path):
     assert known_tracks([moved, now, renamed], kept) == {"a": track}
     assert known_tracks([same, gone], kept) == {"a": track, "c": track}
     assert known_tracks([same], {}) == {}
+    longer = file(tmp_path / "a", b"a" * 999_999, length=2)
+    assert known_tracks([longer, gone], kept) == {"c": track}
