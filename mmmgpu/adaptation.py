@@ -249,7 +249,7 @@ class _Adaptation:
 
     def _analyse(
         self, frames: Frames, basis: Basis, known: Mapping[str, Track]
-    ) -> tuple[tuple[Floats, Floats], tuple[list[Floats], list[Floats]]]:
+    ) -> tuple[tuple[Floats, Floats], tuple[list[F32], list[F32]]]:
         """The old prototypes and the clips in the new ones.
 
         Eq. 11-12, A (M' - 1, M - 1) and B (M', M): column k is old prototype k. Then alpha and beta
@@ -261,8 +261,7 @@ class _Adaptation:
         own = [Pictures(f"prototypes-{i}", old.images[k]) for i, k in enumerate(halves) if len(k)]
         pieces: list[Seen] = [*frames.stretches, *own]
         flow, backend = self.options.flow, self.backend
-        found = analyse(self.folder, pieces, basis, flow=flow, backend=backend)
-        alpha, beta = map(np.concatenate, zip(*found, strict=True))
+        alpha, beta = analyse(self.folder, pieces, basis, flow=flow, backend=backend)
         last = {int(k): len(frames) + i for i, k in enumerate(strange)}
         rows = [last[k] if k in last else frames.number(*at) for k, at in enumerate(sources)]
         a, b = (z[rows].T.astype(np.float64) for z in (alpha, beta))

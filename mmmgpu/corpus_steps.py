@@ -36,7 +36,6 @@ from mmmgpu.progress import progress_bar
 from mmmgpu.regions import Region, mouth_mask
 from mmmgpu.tracks import Reference, Track, track_clip
 
-Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
 T = TypeVar("T")
 R = TypeVar("R")
@@ -173,21 +172,21 @@ def _looking(shared: tuple[Path, Region]) -> Work:
 
 def analyse_corpus(
     folder: Path, frames: Frames, basis: Basis, *, flow: str, backend: str
-) -> tuple[list[Floats], list[Floats]]:
+) -> tuple[list[F32], list[F32]]:
     """alpha (T, M - 1) and beta (T, M) of every clip of `frames`."""
-    found = analyse(folder, frames.stretches, basis, flow=flow, backend=backend)
-    alpha, beta = (frames.by_clip(np.concatenate(z)) for z in zip(*found, strict=True))
-    return alpha, beta
+    alpha, beta = analyse(folder, frames.stretches, basis, flow=flow, backend=backend)
+    return frames.by_clip(alpha), frames.by_clip(beta)
 
 
 def analyse(
     folder: Path, pieces: Sequence[Seen], basis: Basis, *, flow: str, backend: str
-) -> list[tuple[Floats, Floats]]:
-    """alpha (T, M - 1) and beta (T, M) of the T frames of every piece."""
+) -> tuple[F32, F32]:
+    """alpha (N, M - 1) and beta (N, M) of the frames of all pieces, N in all."""
     shared = (folder, basis, flow, backend)
     for_all(folder, _analysing, shared, "analysis", "analyse frames", pieces)
     done = [finished_step(folder, "analysis", piece) for piece in pieces]
-    return [(found["alpha"], found["beta"]) for found in done]
+    alpha, beta = (np.concatenate([found[z] for found in done]) for z in ("alpha", "beta"))
+    return alpha, beta
 
 
 def _analysing(shared: tuple[Path, Basis, str, str]) -> Work:
@@ -236,7 +235,7 @@ def tracking_notes(frames: Frames, skipped: Mapping[str, str]) -> dict[str, Any]
     }
 
 
-def utterances_of(frames: Frames, coordinates: Sequence[Floats]) -> list[Utterance]:
+def utterances_of(frames: Frames, coordinates: Sequence[F32]) -> list[Utterance]:
     """One stream of every clip, (T, d) each, without the frames whose head was not found."""
     utterances = []
     for clip, z in zip(frames.clips, coordinates, strict=True):

@@ -16,7 +16,6 @@ from mmmgpu.regions import Region
 from mmmgpu.tracks import Track, crop, crops, rebase
 from mmmgpu.videos import read_chosen_frames
 
-Floats = NDArray[np.float64]
 F32 = NDArray[np.float32]
 S = TypeVar("S", bound=np.generic)
 T = TypeVar("T")
@@ -78,6 +77,11 @@ class Frames:
         return sum(clip.length for clip in self.clips)
 
     @property
+    def _ends(self) -> NDArray[np.int64]:
+        """The numbers behind the last frame of each clip."""
+        return np.cumsum([clip.length for clip in self.clips])
+
+    @property
     def registered(self) -> NDArray[np.bool_]:
         return np.concatenate([self.tracks[c.name].registered for c in self.clips])
 
@@ -103,7 +107,7 @@ class Frames:
 
     def by_clip(self, rows: NDArray[S]) -> list[NDArray[S]]:
         """Rows of all frames, and others behind them, (N, d) -> (T, d) of every clip."""
-        return np.split(rows, np.cumsum([clip.length for clip in self.clips]))[:-1]
+        return np.split(rows, self._ends)[:-1]
 
     def pictures(
         self, numbers: Iterable[int]
@@ -140,9 +144,8 @@ class Frames:
         take: Given a frame in full, its clip and its place in it.
         """
         wanted = np.unique(np.fromiter(numbers, np.int64))
-        ends = np.cumsum([clip.length for clip in self.clips])
-        parts = np.split(wanted, np.searchsorted(wanted, ends))[:-1]
-        jobs = [job for job in zip(self.clips, ends, parts, strict=True) if len(job[2])]
+        parts = np.split(wanted, np.searchsorted(wanted, self._ends))[:-1]
+        jobs = [job for job in zip(self.clips, self._ends, parts, strict=True) if len(job[2])]
 
         def read(job: tuple[Clip, int, NDArray[np.int64]], cancelled: Cancelled) -> list[T]:
             clip, end, own = job
