@@ -181,6 +181,10 @@ FACTS = {
         lambda f: {"tracked": [one | {"residual": "small"} for one in f["tracked"]]},
         "tracked",
     ),
+    "tracked a residual that is none": (
+        lambda f: {"tracked": [one | {"residual": np.nan} for one in f["tracked"]]},
+        "tracked",
+    ),
     "suffix a path": (lambda f: {"calm": f["calm"] | {"suffix": "/../../x.mkv"}}, "suffix"),
 }
 
