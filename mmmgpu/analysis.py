@@ -27,7 +27,7 @@ from mmmgpu.backends import Backend
 from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import LIP, MOUTH, Basis, around, cut
 from mmmgpu.errors import InputError
-from mmmgpu.flows import Matcher, at_scale, concatenate, matcher, pull
+from mmmgpu.flows import Matcher, at_scale, concatenate, matcher, read_at
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
@@ -53,7 +53,7 @@ class Analyzer:
     basis: cut to the rectangle `inside` in which the masks are not zero.
     kernels, held: the backend, and the prototypes on it.
     pixels: indices of n reference pixels, every second of those with w_f above 0.02; weight (n,):
-        w_f there.
+        w_f there; places (n, 2): where they are, (x, y) [px].
     along: the prototype flows there, x above y, (2 n, M - 1).
     gram: Cholesky factor of the regularised Gram matrix of the flows.
     everywhere: sqrt(w_t), but not below 0.01: what a step needs to see, (h, pitch).
@@ -68,6 +68,7 @@ class Analyzer:
     held: Any
     pixels: NDArray[np.int64]
     weight: F32
+    places: F32
     along: F32
     gram: tuple[Floats, bool]
     everywhere: F32
@@ -84,7 +85,7 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
     inside = around((basis.w_t > MOUTH) | (basis.w_f > LIP))
     basis = cut(basis, inside)
     pixels = np.flatnonzero((basis.w_f > LIP) & chessboard(basis.w_f.shape))
-    weight = basis.w_f.ravel()[pixels]
+    weight, w = basis.w_f.ravel()[pixels], basis.w_f.shape[1]
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
     along = np.ascontiguousarray(moving.transpose(2, 1, 0).reshape(2 * len(pixels), -1))
     weighted = along * np.sqrt(np.tile(weight, 2))[:, None]
@@ -104,6 +105,7 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
         held=kernels.hold_prototypes(basis.images, basis.flows, HOLE),
         pixels=pixels,
         weight=weight,
+        places=np.stack([pixels % w, pixels // w], axis=1).astype(np.float32),
         along=along,
         gram=cho_factor(regular),
         everywhere=planes(np.maximum(root, UNSEEN)[..., None])[0],
@@ -171,7 +173,8 @@ def _refine(analyzer: Analyzer, image: F32, alpha: Floats, flow: F32, made: F32)
     """
     mean = (made + image) / 2
     slopes = [cv2.Scharr(mean, -1, *axis) / 32 for axis in ((1, 0), (0, 1))]
-    error, gx, gy = (_pulled(analyzer, f, flow) for f in (image - made, *slopes))
+    seen = analyzer.places + flow.reshape(-1, 2)[analyzer.pixels]
+    error, gx, gy = (read_at(field, seen) for field in (image - made, *slopes))
     w = analyzer.weight / (1 + _dot(error, error) / OUTLIER**2)
     xx, xy, yy = (w * _dot(a, b) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
     rows = _rooted(xx, xy, yy, *np.split(analyzer.along, 2))
@@ -200,11 +203,6 @@ def _rooted(xx: F32, xy: F32, yy: F32, x: F32, y: F32) -> F32:
     rows[: len(x)] += side[:, None] * y
     np.multiply(y, np.sqrt(np.maximum(yy - side**2, 0))[:, None], out=rows[len(x) :])
     return rows
-
-
-def _pulled(analyzer: Analyzer, field: F32, flow: F32) -> F32:
-    """`field` (h, w, 3) read at p + flow(p) for the pixels of the analyzer, (n, 3)."""
-    return pull(field, flow).reshape(-1, 3)[analyzer.pixels]
 
 
 def _fit_texture(

@@ -19,6 +19,7 @@ F32 = NDArray[np.float32]
 Matcher = Callable[[F32, F32], F32]
 
 NEIGHBOURS = 8  # edges of a frame in the graph
+ROW = 128  # points read at a time
 LEAST = 16  # [px] width and height of a picture that flow is looked for in
 
 
@@ -83,6 +84,16 @@ def pull(field: F32, flow: F32) -> F32:
     y = np.arange(h, dtype=np.float32)[:, None] + flow[..., 1]
     seen = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(seen, np.float32)
+
+
+def read_at(field: F32, points: F32) -> F32:
+    """`field` (H, W, C) at `points` (n, 2) = (x, y) [px], (n, C): bilinear, border repeated."""
+    n = len(points)
+    # no side of the result may be 32768 long
+    table = np.resize(points, (math.ceil(n / ROW), ROW, 2))
+    x, y = table[..., 0], table[..., 1]
+    seen = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(seen.reshape(-1, field.shape[2])[:n], np.float32)
 
 
 def concatenate(first: F32, second: F32) -> F32:

@@ -8,6 +8,7 @@ from worlds import texture
 from mmmgpu.flows import (
     MATCHERS,
     NEIGHBOURS,
+    ROW,
     at_scale,
     best_flow,
     concatenate,
@@ -16,6 +17,7 @@ from mmmgpu.flows import (
     matcher,
     path_to,
     pull,
+    read_at,
     shortest_paths,
 )
 
@@ -196,3 +198,15 @@ def test_flows_of_a_tree_are_concatenated_step_by_step():
     assert sorted(flows) == [7, 8, 9]
     for i, flow in flows.items():
         np.testing.assert_array_equal(flow, np.full((4, 5, 2), i - 3))
+
+
+@pytest.mark.parametrize("count", [1, ROW, 2 * ROW + 3, 40_000])
+def test_points_are_read_as_a_flow_reads_them(count):
+    rng = np.random.default_rng(2)
+    height, width = 9, 7
+    field = rng.random((height, width, 3)).astype(np.float32)
+    pixels = rng.integers(0, height * width, count)
+    flow = rng.uniform(-4, 4, (height, width, 2)).astype(np.float32)
+    y, x = np.divmod(pixels, width)
+    points = (np.stack([x, y], axis=1) + flow[y, x]).astype(np.float32)
+    np.testing.assert_array_equal(read_at(field, points), pull(field, flow)[y, x])
