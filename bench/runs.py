@@ -20,7 +20,9 @@ from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 from mmmgpu.voices import is_installed
 
-VERSION = 3  # of the record; 2: no pause for OpenBLAS's threads; 1: short runs were not repeated
+# of the record; 3: single turns were not kept; 2: no pause for OpenBLAS's threads; 1: short runs
+# were not repeated
+VERSION = 4
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
 
 

@@ -1,9 +1,12 @@
 """What the kernels are meant to reach, as ratios within one run, and whether they do.
 
-Each is judged by the best backend, with the medians of the run.
+Each is judged by the best backend. Of two contenders that took turns the ratio is the median of the
+ratios within a turn: a machine that is busy for a while is busy for both.
 """
 
 from dataclasses import dataclass
+
+import numpy as np
 
 from mmmgpu.bench.timing import COPY, REFERENCE
 
@@ -20,10 +23,10 @@ class Target:
     most: bool = False
 
 
-def median(results, key, *who):
-    """The least median [ms] of some contenders of a work; None where none of them was measured."""
+def rows_of(results, key, *families):
+    """What is known of some contenders of a work; none where they were not measured."""
     rows = results["works"].get(key, {}).get("contenders", {})
-    return min((rows[w]["median_ms"] for w in rows if family(w) in who), default=None)
+    return [row for who, row in rows.items() if family(who) in families]
 
 
 def family(contender):
@@ -31,12 +34,21 @@ def family(contender):
     return contender.partition(":")[0]
 
 
+def ratio(over, under):
+    """How many times as long `over` takes as `under`; of medians where one had a turn only."""
+    pair = over["turns_ms"], under["turns_ms"]
+    if len(pair[0]) != len(pair[1]):
+        pair = over["median_ms"], under["median_ms"]
+    return float(np.median(np.divide(*pair)))
+
+
 def faster_than(key, peer):
     """How many times faster than a peer the best of ours is."""
 
     def value(results):
-        theirs, ours = median(results, key, peer), median(results, key, *BACKENDS, "adjoint")
-        return theirs / ours if theirs and ours else None
+        ours = rows_of(results, key, *BACKENDS, "adjoint")
+        theirs = rows_of(results, key, peer)
+        return max((ratio(their, our) for their in theirs for our in ours), default=None)
 
     return value
 
@@ -45,8 +57,8 @@ def per_second(key):
     """Items a second of the best of ours."""
 
     def value(results):
-        ours = median(results, key, *BACKENDS)
-        return 1e3 * results["works"][key]["items"] / ours if ours else None
+        ours = [row["median_ms"] for row in rows_of(results, key, *BACKENDS)]
+        return 1e3 * results["works"][key]["items"] / min(ours) if ours else None
 
     return value
 
@@ -55,17 +67,18 @@ def of_one_pass(key):
     """The time of the best of ours in those of a copy of as many bytes, in the same turns."""
 
     def value(results):
-        ours, once = median(results, key, *BACKENDS), median(results, key, COPY)
-        return ours / once if ours and once else None
+        copies = rows_of(results, key, COPY)
+        ours = rows_of(results, key, *BACKENDS)
+        return min((ratio(our, copy) for our in ours for copy in copies), default=None)
 
     return value
 
 
 def apart(results):
     """The largest ratio between the two backends over all works."""
-    pairs = [[median(results, key, name) for name in BACKENDS] for key in results["works"]]
-    ratios = [max(pair) / min(pair) for pair in pairs if all(pair)]
-    return max(ratios, default=None)
+    pairs = [[rows_of(results, key, name) for name in BACKENDS] for key in results["works"]]
+    found = [ratio(a, b) for first, second in pairs for a in first for b in second]
+    return max((max(r, 1 / r) for r in found), default=None)
 
 
 def steepest(results):

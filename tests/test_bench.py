@@ -147,7 +147,7 @@ def test_a_library_that_is_missing_is_named(monkeypatch):
 def run_of(**medians):
     """A record with works of one contender a name, quartiles 2 % around the medians."""
     rows = {
-        who: {"median_ms": ms, "quartiles_ms": [0.98 * ms, 1.02 * ms]}
+        who: {"median_ms": ms, "quartiles_ms": [0.98 * ms, 1.02 * ms], "turns_ms": [ms]}
         for who, ms in medians.items()
     }
     works = {"blend": {"name": "blend", "contenders": rows}}
@@ -197,6 +197,17 @@ def test_a_target_is_met_or_not_by_the_best_backend():
     values = {name: (t["value"], t["met"]) for name, t in judge_targets(results).items()}
     assert values["threads, sample, of a copy's gain"] == (0.95, True)
     assert values["threads, distance_scan"] == (3, True)
+
+
+@pytest.mark.parametrize(
+    ("theirs", "value"), [([5, 4.4, 11], 1.1), ([5], 1.25)], ids=["in turns", "one turn"]
+)
+def test_ratios_are_those_within_a_turn(theirs, value):
+    results = run_of(warp=4, numba=5)
+    rows = results["works"]["blend"]["contenders"]
+    rows["warp"]["turns_ms"], rows["numba"]["turns_ms"] = [1, 4, 10], theirs
+    results["works"]["splat"] = results["works"]["blend"] | {"items": 1}
+    assert judge_targets(results)["forward_warp over numba"]["value"] == value
 
 
 @pytest.mark.parametrize("power", [0.5, 1, 2])
