@@ -1,7 +1,8 @@
 """Pictures of a report: as data URIs, as inline SVG, and the drawing on top of video frames.
 
 Everything is drawn through Matplotlib's objects, never through pyplot: there is no global state,
-and no window system is asked for.
+and no window system is asked for. It is imported when something is drawn: a command that may write
+a report need not wait for it.
 """
 
 import base64
@@ -9,15 +10,16 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mmmgpu.phones import SIL
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.floating[Any]]
@@ -113,13 +115,19 @@ def seen_through(image: NDArray[Any], mask: Floats) -> Bytes:
     return np.asarray(np.rint(to_bytes(image) * share + 128 * (1 - share)), np.uint8)
 
 
+def _figure(**settings: Any) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(**settings)
+
+
 def captions(texts: Sequence[str], width: int) -> Bytes:
     """A dark strip with a text in the middle of each of its parts, `width` [px] each.
 
     Shape (CAPTION_HEIGHT, len(texts) * width, 3) uint8.
     """
     size = len(texts) * width, CAPTION_HEIGHT
-    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="#1c1e22")
+    figure = _figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="#1c1e22")
     for i, text in enumerate(texts):
         middle = (i + 0.5) / len(texts)
         figure.text(middle, 0.48, text, color="white", fontsize=9.5, ha="center", va="center")
@@ -135,7 +143,7 @@ def curves(panels: Sequence[Panel], labels: Sequence[str], fps: float) -> str:
     labels: phone of every frame, length T. fps: frames a second.
     """
     times = np.arange(len(labels)) / fps
-    figure = Figure(figsize=(10, 0.8 + 1.5 * len(panels)), layout="constrained")
+    figure = _figure(figsize=(10, 0.8 + 1.5 * len(panels)), layout="constrained")
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axis, panel in zip(axes, panels, strict=True):
         for name, values in panel.curves.items():
@@ -166,7 +174,7 @@ def _draw_phones(axis: Any, labels: Sequence[str], fps: float, *, named: bool) -
 
 def learning_curve(errors: Mapping[str, Floats]) -> str:
     """Mean squared errors (I + 1,) by name, each as a share of its first: inline SVG."""
-    figure = Figure(figsize=(5.5, 2.6), layout="constrained")
+    figure = _figure(figsize=(5.5, 2.6), layout="constrained")
     axis = figure.subplots()
     for (name, values), colour in zip(errors.items(), ("#1d7fd6", "#d9730d"), strict=False):
         axis.plot(np.arange(len(values)), 100 * values / values[0], label=name, color=colour)
@@ -176,8 +184,10 @@ def learning_curve(errors: Mapping[str, Floats]) -> str:
     return to_svg(figure)
 
 
-def to_svg(figure: Figure) -> str:
+def to_svg(figure: "Figure") -> str:
     """A figure as inline SVG: text stays text, ink takes the page's colour, no background."""
+    from matplotlib import rc_context
+
     for axis in figure.axes:
         axis.patch.set_alpha(0)
         axis.tick_params(colors=INK, labelsize=8)

@@ -35,6 +35,10 @@ def test_the_list_of_slow_libraries_is_seen():
     assert loaded_by("import mmmgpu; mmmgpu.get_backend") & SLOW == {"numpy"}
 
 
+def test_a_report_loads_what_draws_only_when_it_draws():
+    assert "matplotlib" not in loaded_by("import mmmgpu.reports, mmmgpu.transfer_reports")
+
+
 @pytest.mark.parametrize("name", PUBLIC)
 def test_name_is_there(name):
     assert getattr(mmmgpu, name) is not None
