@@ -7,12 +7,12 @@ and two rows of the corpus share their loads; a thread does four rows, as in Ope
 
 import warp as wp
 
+from mmmgpu.kernels.lanes import LANES, get, vec16
+
 wp.set_module_options({"enable_backward": False})
 
-LANES = 16
-BLOCK = wp.constant(16)  # vectors summed in float32
+BLOCK = wp.constant(16 * LANES)  # points summed in float32
 QUERIES, ROWS = wp.constant(2), wp.constant(4)  # of a thread, two rows at a time
-vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec32 = wp.types.vector(length=2 * LANES, dtype=wp.float32)
 
 
@@ -66,19 +66,47 @@ def pack_flows(
 
 
 @wp.func
-def root(x: vec16):
-    """The square root of each."""
-    y = x
+def squared(queries: wp.array[float], q: int, planes: wp.array[float], f: int):
+    """Squared differences of 16 points in one channel."""
+    d = get(queries, q) - get(planes, f)
+    return wp.cw_mul(d, d)
+
+
+@wp.func
+def lengths(
+    queries: wp.array[float],
+    q: int,
+    planes: wp.array[float],
+    f: int,
+    plane: int,
+    channels: int,
+):
+    """Distances of 16 points. Pairs share their loads where flows and colours need no loop."""
+    norm = squared(queries, q, planes, f)
+    if channels > 1:
+        norm += squared(queries, q + plane, planes, f + plane)
+    if channels > 2:
+        norm += squared(queries, q + 2 * plane, planes, f + 2 * plane)
+    for c in range(3, channels):
+        norm += squared(queries, q + c * plane, planes, f + c * plane)
     for lane in range(LANES):
-        y[lane] = wp.sqrt(x[lane])
-    return y
+        norm[lane] = wp.sqrt(norm[lane])
+    return norm
+
+
+@wp.func
+def sum_of(part: vec16):
+    four = wp.vec4()
+    for j in range(4):
+        four[j] = (part[j] + part[j + 8]) + (part[j + 4] + part[j + 12])
+    return wp.float64(four[0]) + wp.float64(four[1]) + (wp.float64(four[2]) + wp.float64(four[3]))
 
 
 @wp.kernel
 def distance_scan(
-    queries: wp.array[vec16],  # (K, C, V)
-    planes: wp.array[vec16],  # (tile, C, V), row 0 is the corpus row `start`
-    weights: wp.array[vec16],  # (V,)
+    queries: wp.array[float],  # (K, C, V, 16)
+    planes: wp.array[float],  # (tile, C, V, 16), row 0 is the corpus row `start`
+    weights: wp.array[float],  # (V, 16)
     number: int,  # K
     corpus: int,  # N
     start: int,
@@ -97,42 +125,33 @@ def distance_scan(
     k0 = QUERIES * ((first + tid) % groups)
     k1 = wp.min(k0 + 1, number - 1)  # of an odd number the last is done twice
     begin_row = ROWS * ((first + tid) / groups)
-    row = channels * vectors
+    plane = LANES * vectors
+    row = channels * plane
     for n0 in range(begin_row, wp.min(begin_row + ROWS, tile), 2):
         n1 = wp.min(n0 + 1, tile - 1)
         total00 = wp.float64(0.0)
         total01 = wp.float64(0.0)
         total10 = wp.float64(0.0)
         total11 = wp.float64(0.0)
-        for begin in range(0, vectors, BLOCK):
+        for begin in range(0, plane, BLOCK):
             part00 = vec16()
             part01 = vec16()
             part10 = vec16()
             part11 = vec16()
-            for v in range(begin, wp.min(begin + BLOCK, vectors)):
-                norm00 = vec16()
-                norm01 = vec16()
-                norm10 = vec16()
-                norm11 = vec16()
-                for i in range(v, row, vectors):
-                    q0 = queries[k0 * row + i]
-                    q1 = queries[k1 * row + i]
-                    f0 = planes[n0 * row + i]
-                    f1 = planes[n1 * row + i]
-                    norm00 += wp.cw_mul(q0 - f0, q0 - f0)
-                    norm01 += wp.cw_mul(q0 - f1, q0 - f1)
-                    norm10 += wp.cw_mul(q1 - f0, q1 - f0)
-                    norm11 += wp.cw_mul(q1 - f1, q1 - f1)
-                w = weights[v]
-                part00 += wp.cw_mul(w, root(norm00))
-                part01 += wp.cw_mul(w, root(norm01))
-                part10 += wp.cw_mul(w, root(norm10))
-                part11 += wp.cw_mul(w, root(norm11))
-            for lane in range(LANES):
-                total00 += wp.float64(part00[lane])
-                total01 += wp.float64(part01[lane])
-                total10 += wp.float64(part10[lane])
-                total11 += wp.float64(part11[lane])
+            for i in range(begin, wp.min(begin + BLOCK, plane), LANES):
+                q0 = k0 * row + i
+                q1 = k1 * row + i
+                f0 = n0 * row + i
+                f1 = n1 * row + i
+                w = get(weights, i)
+                part00 += wp.cw_mul(w, lengths(queries, q0, planes, f0, plane, channels))
+                part01 += wp.cw_mul(w, lengths(queries, q0, planes, f1, plane, channels))
+                part10 += wp.cw_mul(w, lengths(queries, q1, planes, f0, plane, channels))
+                part11 += wp.cw_mul(w, lengths(queries, q1, planes, f1, plane, channels))
+            total00 += sum_of(part00)
+            total01 += sum_of(part01)
+            total10 += sum_of(part10)
+            total11 += sum_of(part11)
         distance[k0 * corpus + start + n0] = float(total00)
         distance[k0 * corpus + start + n1] = float(total01)
         distance[k1 * corpus + start + n0] = float(total10)
