@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32
 from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
-from mmmgpu.backends.memory import keep_freed_memory
+from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
 from mmmgpu.errors import InputError
 
 NO_MEMORY = "Failed to allocate"  # what Warp says
@@ -104,7 +104,10 @@ class Warp(Launches):
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
         scalar = cast(Any, wp).dtype_from_numpy(dtype)
         with _faults_of(self.device):
-            return wp.empty(shape, dtype=scalar, device=self.device)
+            made = wp.empty(shape, dtype=scalar, device=self.device)
+        if made.capacity > KEPT and self.device == "cpu":
+            use_huge_pages(made.ptr, made.capacity)
+        return made
 
     def copy(self, target: Any, source: Any, first: int, count: int) -> None:
         size = source.size // source.shape[0]

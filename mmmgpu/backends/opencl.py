@@ -24,7 +24,7 @@ from mmmgpu.arrays import F32
 from mmmgpu.backends import default_threads
 from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
-from mmmgpu.backends.memory import keep_freed_memory
+from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
 from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
 from mmmgpu.errors import DeviceError, InputError
@@ -192,7 +192,11 @@ class OpenCL(Launches):
         size = math.prod(shape) * kind.itemsize
         with _faults_of(self.name):
             flags = cl.mem_flags.READ_WRITE
-            return Array(cl.Buffer(self.queue.context, flags, size) if size else None, shape, kind)
+            data = cl.Buffer(self.queue.context, flags, size) if size else None
+        made = Array(data, shape, kind)
+        if size > KEPT and self.queue.device.type & cl.device_type.CPU:
+            use_huge_pages(self.to_host(made).ctypes.data, size)
+        return made
 
     def copy(self, target: Any, source: Any, first: int, count: int) -> None:
         row = source.size // source.shape[0] * source.dtype.itemsize
