@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 
 import mmmgpu
+from mmmgpu.bench.startup import FIRST_FRAME
 
 SLOW = {
     *("av", "cv2", "daqp", "espeakng_loader", "matplotlib", "numba", "numpy", "pocketsphinx"),
@@ -37,6 +38,14 @@ def test_the_list_of_slow_libraries_is_seen():
 
 def test_a_report_loads_what_draws_only_when_it_draws():
     assert "matplotlib" not in loaded_by("import mmmgpu.reports, mmmgpu.transfer_reports")
+
+
+@pytest.mark.parametrize("runtime", ["warp", "opencl"])
+def test_the_first_frame_waits_for_no_scipy(runtime):
+    """SciPy takes as long to load as half of Warp."""
+    loaded = loaded_by(f"import sys\nsys.argv[1:] = ['{runtime}']\n{FIRST_FRAME}")
+    assert runtime.replace("opencl", "pyopencl") in loaded
+    assert "scipy" not in loaded
 
 
 @pytest.mark.parametrize("name", PUBLIC)

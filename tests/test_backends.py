@@ -1,5 +1,6 @@
 """Names, devices, threads, damaged caches, and chains that stay on the device."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mmmgpu import backends
-from mmmgpu.backends import BACKENDS, default_threads, get_backend, opencl
+from mmmgpu.backends import BACKENDS, default_threads, get_backend, list_devices, opencl
 from mmmgpu.errors import InputError
 
 EVERYTHING = """
@@ -95,6 +96,18 @@ def test_a_strided_array_is_read_as_it_is(name, part):
     one = np.ones(3, np.float32)
     apart = k.distance_scan(k.to_device(some), k.to_device(some.copy()), k.to_device(one))
     assert_allclose(np.diag(k.to_host(apart)), 0, rtol=0, atol=1e-6)
+
+
+def test_garbage_is_looked_for_again_once_a_backend_is_imported(monkeypatch, tmp_path):
+    source = (
+        "import gc\nseen = gc.isenabled()\ndef list_devices():\n    return {'seen': str(seen)}\n"
+    )
+    (tmp_path / "backend_that_looks.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(BACKENDS, "looking", "backend_that_looks")
+    assert gc.isenabled()
+    assert list_devices("looking") == {"seen": "False"}
+    assert gc.isenabled()
 
 
 def test_a_library_that_is_missing_says_what_to_install(monkeypatch):

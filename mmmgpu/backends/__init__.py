@@ -7,8 +7,11 @@ module with ``open_backend(device, threads)`` and ``list_devices()``, and add it
 """
 
 import functools
+import gc
 import importlib
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol, cast
 
 from numpy.typing import NDArray
@@ -118,11 +121,24 @@ def get_backend(name: str, threads: int | None = None) -> Backend:
 
 def _module(family: str) -> Any:
     try:
-        return importlib.import_module(BACKENDS[family])
+        with _nothing_collected():
+            return importlib.import_module(BACKENDS[family])
     except ModuleNotFoundError as e:
         raise InputError(
             f"backend {family!r} needs {e.name!r}, which is not installed; pip install 'mmmgpu'"
         ) from e
+
+
+@contextmanager
+def _nothing_collected() -> Iterator[None]:
+    """No search for garbage: what an import makes stays, and looking through it takes a tenth."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def default_threads() -> int:

@@ -15,13 +15,12 @@ frame.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends import default_threads
@@ -30,6 +29,8 @@ from mmmgpu.backends.reference import landings
 
 I32 = NDArray[np.int32]
 Numbers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Entries = tuple[Numbers, Numbers, Floats]  # rows, columns and values of a sparse matrix
 
 
 @dataclass(frozen=True)
@@ -79,16 +80,28 @@ def orient(flows: F32, hole: float) -> Orientations:
         parts=np.concatenate([o.parts for o in done]),
         rows=_starts([len(o.targets) for o in done]),
         targets=np.concatenate([o.targets for o in done]).astype(np.int32),
-        starts=_starts(np.concatenate([np.diff(r.indptr) for r in rows])),
-        row_taps=np.concatenate([r.indices for r in rows]).astype(np.int32),
-        row_shares=np.concatenate([r.data for r in rows]).astype(np.float32),
-        nodes=h * pitch_of(w) + max(o.rows[0].shape[0] for o in done),
+        starts=_starts(np.concatenate([r.lengths for r in rows])),
+        row_taps=np.concatenate([r.taps for r in rows]).astype(np.int32),
+        row_shares=np.concatenate([r.shares for r in rows]).astype(np.float32),
+        nodes=h * pitch_of(w) + max(len(o.rows[0].lengths) for o in done),
     )
 
 
 @dataclass(frozen=True)
+class _Rows:
+    """Rows of a sparse matrix: taps of each, (n,), and these with their shares, (lengths.sum(),).
+
+    `scipy.sparse` would take an eighth of the time to a new process's first frame to load.
+    """
+
+    lengths: Numbers
+    taps: Numbers
+    shares: Floats
+
+
+@dataclass(frozen=True)
 class _Oriented:
-    """Of one prototype: shares (h, w); number of parts of each vector; parts (n, 3); sparse rows.
+    """Of one prototype: shares (h, w); number of parts of each vector; parts (n, 3).
 
     rows, targets: of cells and of holes, and which nodes these are.
     """
@@ -96,7 +109,7 @@ class _Oriented:
     shares: F32
     counts: Numbers
     parts: I32
-    rows: tuple[Any, Any]
+    rows: tuple[_Rows, _Rows]
     targets: Numbers
 
 
@@ -109,10 +122,10 @@ def _orient_one(flow: F32, hole: float) -> _Oriented:
     check_some_valid(valid.sum(keepdims=True))
     used = valid.ravel()[target] & (share > 0)
     cells, through = _filling(valid)
-    cells.indices = _padded(cells.indices, w)
-    through.indices += first_cell
     holes = _padded(np.flatnonzero(~valid), w)
-    targets = np.concatenate([first_cell + np.arange(cells.shape[0]), holes])
+    targets = np.concatenate([first_cell + np.arange(len(cells.lengths)), holes])
+    cells = replace(cells, taps=_padded(cells.taps, w))
+    through = replace(through, taps=first_cell + through.taps)
     shares = np.divide(1, weight, where=valid, out=np.zeros_like(weight)).astype(np.float32)
     counts, parts = _parts(target[used], source[used], h, w)
     return _Oriented(shares, counts, parts, (cells, through), targets)
@@ -152,8 +165,8 @@ def _padded(pixels: NDArray[Any], width: int) -> Numbers:
     return y * pitch_of(width) + x
 
 
-def _filling(valid: NDArray[np.bool_]) -> tuple[Any, Any]:
-    """Pull-push as shares: of pixels in cells (C, h w), and of cells in holes (holes, C).
+def _filling(valid: NDArray[np.bool_]) -> tuple[_Rows, _Rows]:
+    """Pull-push as shares: of pixels in cells, and of cells in holes.
 
     Only the cells are there that a hole needs and that have a valid pixel.
     """
@@ -161,34 +174,51 @@ def _filling(valid: NDArray[np.bool_]) -> tuple[Any, Any]:
     y, x = _divided(np.arange(h * w), w)
     inside = valid.ravel()
     empty = np.flatnonzero(~inside)
-    needs = sparse.identity(len(empty), format="csr")
-    cells, through = [sparse.csr_matrix((0, h * w))], [sparse.csr_matrix((len(empty), 0))]
-    level = 0
-    while len(empty):
-        needs = needs @ _between(empty, h, w)
+    needs: Entries = np.arange(len(empty)), empty, np.ones(len(empty))  # of holes, in empty cells
+    cells: list[Entries] = [_NONE]
+    through: list[Entries] = [_NONE]
+    level, count = 0, 0
+    while len(needs[0]):
+        needs = _coarser(needs, h, w)
         level, h, w = level + 1, (h + 1) // 2, (w + 1) // 2
         cell = (y >> level) * w + (x >> level)
         number = np.bincount(cell[inside], minlength=h * w)
-        needed = np.unique(needs.indices)
-        full, empty = needed[number[needed] > 0], needed[number[needed] == 0]
+        full = number[needs[1]] > 0
+        used = np.unique(needs[1][full])
         place = np.full(h * w, -1)
-        place[full] = np.arange(len(full))
+        place[used] = np.arange(count, count + len(used))
+        count += len(used)
         member = np.flatnonzero(inside & (place[cell] >= 0))
-        share = (1 / number[cell[member]], (place[cell[member]], member))
-        cells.append(sparse.csr_matrix(share, shape=(len(full), len(cell))))
-        through.append(needs[:, full])
-        needs = needs[:, empty]
-    return sparse.vstack(cells, format="csr"), sparse.hstack(through, format="csr")
+        cells.append((place[cell[member]], member, 1 / number[cell[member]]))
+        hole, by, share = needs
+        through.append((hole[full], place[by[full]], share[full]))
+        needs = hole[~full], by[~full], share[~full]
+    return _in_rows(cells, count), _in_rows(through, len(empty))
 
 
-def _between(pixels: Numbers, h: int, w: int) -> Any:
-    """Some pixels of a level of h x w, interpolated from the next coarser one: (n, cells)."""
+_NONE: Entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+
+
+def _coarser(needs: Entries, h: int, w: int) -> Entries:
+    """What holes need of cells of h x w, each interpolated from the next coarser level."""
+    hole, cell, share = needs
     rows, columns = (h + 1) // 2, (w + 1) // 2
-    y, x = _divided(pixels, w)
+    y, x = _divided(cell, w)
     y0, x0 = y // 2, x // 2
     y1 = np.clip(y0 + 2 * (y % 2) - 1, 0, rows - 1)
     x1 = np.clip(x0 + 2 * (x % 2) - 1, 0, columns - 1)
-    cell = np.stack([y0 * columns + x0, y0 * columns + x1, y1 * columns + x0, y1 * columns + x1])
-    share = np.repeat([0.5625, 0.1875, 0.1875, 0.0625], len(pixels))
-    pixel = np.tile(np.arange(len(pixels)), 4)
-    return sparse.csr_matrix((share, (pixel, cell.ravel())), shape=(len(pixels), rows * columns))
+    four = [y0 * columns + x0, y0 * columns + x1, y1 * columns + x0, y1 * columns + x1]
+    key = np.concatenate([hole * (rows * columns) + by for by in four])
+    order = np.argsort(key)
+    key = key[order]
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    shares = np.concatenate([part * share for part in (0.5625, 0.1875, 0.1875, 0.0625)])
+    hole, cell = _divided(key[starts], rows * columns)
+    return hole, cell, np.add.reduceat(shares[order], starts)
+
+
+def _in_rows(parts: Sequence[Entries], number: int) -> _Rows:
+    """All entries together, in the order of their rows, of which there are `number`."""
+    row, tap, share = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(row, kind="stable")
+    return _Rows(np.bincount(row, minlength=number), tap[order], share[order])
