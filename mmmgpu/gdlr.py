@@ -11,7 +11,8 @@ E = |z - y|^2, summed over all frames, utterances and dimensions:
     R_g <- R_g - eta_g dE/dR_g,    dE/dR_g = sum over p in g of (dE/dmu_p) xi_p'.
 
 Eq. 16 solves a system for every entry of R_g; the adjoint gives them all by one more solve (see
-`trajectories.System`), and as Sigma does not move, A is factored once for all iterations.
+`trajectories.System`), and as Sigma does not move, A is factored once for all iterations, and where
+it couples no dimensions dE/dmu is linear with one matrix for all of them.
 
 The paper's eta is one small number, which suits neither the length of the corpus nor the scale of
 the coordinates. Were y as free as mu, E would curve along row j of R_g by
@@ -155,8 +156,10 @@ def descend_means(
     """
     R = identity_regressions(len(metric), mean.shape[1])
     path = [mean]
+    slope_of = system.slope_of(z)
     for _ in range(iterations):
-        R = R - _applied(metric, error_and_slope(system, R, mean, z, class_of)[1])
+        by_mean = slope_of(regressed(R, mean, class_of))
+        R = R - _applied(metric, _by_class(by_mean, mean, class_of, len(R)))
         moved = regressed(R, mean, class_of)
         if np.abs(moved).max() > DIVERGED:
             break
@@ -187,10 +190,16 @@ def error_and_slope(
 ) -> tuple[float, Array]:
     """Eq. 4 with the means R_g xi_p, and dE/dR_g, shape (G, d, d + 1)."""
     E, by_mean = system.error_and_slope(regressed(R, mean, class_of), z)
-    xi, slope = extended(mean), np.zeros_like(R)
+    return E, _by_class(by_mean, mean, class_of, len(R))
+
+
+def _by_class(by_mean: Array, mean: Array, class_of: Rows, n_classes: int) -> Array:
+    """dE/dR_g of each class, shape (G, d, d + 1), from dE/dmu_p (P, d)."""
+    xi, d = extended(mean), mean.shape[1]
+    slope = np.zeros((n_classes, d, d + 1))
     for g, own in _members(class_of):
         slope[g] = by_mean[own].T @ xi[own]
-    return E, slope
+    return slope
 
 
 def _members(class_of: Rows) -> list[tuple[int, Rows]]:
@@ -253,10 +262,10 @@ def gain(system: System, mean: Array, class_of: Rows, roots: Array) -> Array:
         c_j, shape (d,), or (1,) of full models.
     """
     of_dimension = (0, 2) if system.precision.ndim == 2 else (0, 1, 2)
-    at_rest = np.zeros((len(system.line.phone), mean.shape[1]))
+    slope_of = system.slope_of(np.zeros((len(system.line.phone), mean.shape[1])))
     V = np.random.default_rng(0).normal(size=roots.shape[:3])
     for _ in range(POWER_ITERATIONS):
         V /= np.sqrt(np.sum(V**2, axis=of_dimension, keepdims=True))
-        moved = _applied(roots, V)
-        V = _applied(roots, error_and_slope(system, moved, mean, at_rest, class_of)[1])
+        by_mean = slope_of(regressed(_applied(roots, V), mean, class_of))
+        V = _applied(roots, _by_class(by_mean, mean, class_of, len(roots)))
     return np.asarray(np.sqrt(np.sum(V**2, axis=of_dimension, keepdims=True)).reshape(-1))

@@ -154,9 +154,10 @@ def _stack(utterances: Sequence[Utterance]) -> tuple[NDArray[np.float64], list[s
 
 def sum_by(group: NDArray[np.int64], x: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     """Sum of the rows of x (N, d) in each of n groups, shape (n, d)."""
-    from scipy.sparse import csr_array
+    from scipy.sparse import csc_array
 
-    member = csr_array((np.ones(len(group)), (group, np.arange(len(group)))), (n, len(group)))
+    frames = len(group)
+    member = csc_array((np.ones(frames), group, np.arange(frames + 1)), (n, frames))
     total: NDArray[np.float64] = member @ x  # np.add.at sums the same, eight times as slowly
     return total
 

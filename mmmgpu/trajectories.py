@@ -25,8 +25,9 @@ Sources: CE05 = Chang & Ezzat, "Transferable Videorealistic Speech Animation" (S
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import comb
 
 import numpy as np
@@ -178,6 +179,30 @@ class System:
         residual = self.follow(mean) - z
         slope = sum_by(self.line.phone, self._pull(self._solve(2 * residual)), len(mean))
         return float(np.sum(residual**2)), slope
+
+    def slope_of(self, z: Array) -> Callable[[Array], Array]:
+        """dE/dmu as a function of mu, for many means and one z (N, d).
+
+        Where dimensions are apart, y_j = G_j mu_j, and E is quadratic: dE/dmu_j at mu is that at 0
+        and 2 G_j' G_j mu_j more. Full models take the adjoint every time.
+        """
+        if self.precision.ndim == 3:
+            return lambda mean: self.error_and_slope(mean, z)[1]
+        at_zero = self.error_and_slope(np.zeros((self.precision.shape[0], z.shape[1])), z)[1]
+        return lambda mean: at_zero + 2 * (self._gram @ mean.T[:, :, None])[:, :, 0].T
+
+    @cached_property
+    def _gram(self) -> Array:
+        """G_j' G_j of diagonal models, shape (d, P, P): a solve for each phone that is there."""
+        phone, n = self.line.phone, len(self.line.phone)
+        present, column = np.unique(phone, return_inverse=True)
+        gram = np.zeros((self.precision.shape[1], *2 * self.precision.shape[:1]))
+        for j, precision in enumerate(self.precision.T):
+            impulses = np.zeros((n, len(present)), order="F")
+            impulses[np.arange(n), column] = self.line.weight * precision[phone]
+            G = _solve(self.factor[:, j * n : (j + 1) * n], impulses)
+            gram[j][np.ix_(present, present)] = G.T @ G
+        return gram
 
     def _pull(self, x: Array) -> Array:
         """D' Sigma^-1 D x, (N, d) -> (N, d)."""

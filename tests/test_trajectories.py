@@ -225,3 +225,19 @@ def test_slope_of_the_system_is_that_of_the_dense_error(make_models):
         e[p, j] = 1e-4
         central = (dense(models.mean + e) - dense(models.mean - e)) / 2e-4
         np.testing.assert_allclose(slope[p, j], central, rtol=1e-5, atol=1e-8)
+
+
+@KINDS
+def test_slope_of_many_means_is_that_of_each(make_models):
+    """Of phones that are not there, too: c and d."""
+    rng = np.random.default_rng(10)
+    models = make_models(rng)
+    clips = [Utterance(rng.normal(size=(len(text), 3)), list(text)) for text in ("aabbba", "bb")]
+    z = np.concatenate([u.z for u in clips])
+    system = factor_system(lay_out_utterances(models, clips), models, np.array([0.5, 1.0, 3.0]))
+    slope_of = system.slope_of(z)
+    for mean in (models.mean, rng.normal(size=models.mean.shape)):
+        want = system.error_and_slope(mean, z)[1]
+        np.testing.assert_allclose(slope_of(mean), want, rtol=1e-11, atol=1e-12)
+        assert not want[2:].any()
+        assert want[:2].all()
