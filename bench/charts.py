@@ -24,7 +24,7 @@ def draw_growth(growth, threads, path):
         for axes, (axis, backends) in zip(charts, growth.items(), strict=True):
             for name, found in backends.items():
                 label = f"{name}: {found['exponent']:.2f}"
-                axes.loglog(found["counts"], found["best_ms"], "o-", ms=3, label=label)
+                axes.loglog(found["counts"], found["median_ms"], "o-", ms=3, label=label)
             axes.set(xlabel=axis, ylabel="best time [ms]")
             tick(axes.xaxis, found["counts"])
             axes.legend(title="exponent", frameon=False)

@@ -56,12 +56,12 @@ def other_tables(results):
                 name,
                 f["exponent"],
                 ", ".join(map(str, f["counts"])),
-                ", ".join(map(str, f["best_ms"])),
+                ", ".join(map(str, f["median_ms"])),
             )
             for axis, backends in growth.items()
             for name, f in backends.items()
         ]
-        yield "Growth", ("with", "by", "exponent", "counts", "best [ms]"), rows
+        yield "Growth", ("with", "by", "exponent", "counts", "median [ms]"), rows
     if threads := results.get("threads"):
         rows = [(work, times[-1]) for work, times in threads["gain"].items()]
         yield f"Gain of {threads['counts'][-1]} threads over one", ("work", "times"), rows

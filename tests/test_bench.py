@@ -21,7 +21,7 @@ from mmmgpu.bench.kernels import kernel_work
 from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
 from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
 from mmmgpu.bench.targets import judge_targets
-from mmmgpu.bench.timing import LEAST, Contender, Effort, Work, measure, take_turns, timed
+from mmmgpu.bench.timing import LEAST, SLOW, Contender, Effort, Work, measure, take_turns, timed
 from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 
@@ -131,6 +131,16 @@ def test_the_processor_s_time_is_that_of_all_threads():
     assert measure(work, ONCE)["contenders"]["a"]["cpu_ms"] > 149
 
 
+@pytest.mark.parametrize(("pause", "turns"), [(0.0, 3), (SLOW + 0.1, 1)])
+def test_a_quick_reference_takes_turns(pause, turns):
+    """So that an hour which gives little is one for both."""
+    runs = {"a": Contender(lambda: lambda: np.ones(1), tolerance=0)}
+    work = Work("ones", lambda: time.sleep(pause) or np.ones(1), runs)
+    found = measure(work, Effort(turns=3, seconds=0.0, most=3))["contenders"]
+    assert found["a"]["turns"] == 3
+    assert found["reference"]["turns"] == turns
+
+
 def test_the_reference_s_part_counts_for_the_whole():
     work = Work("w", lambda: np.ones(2), {"a": Contender(lambda: lambda: np.ones(4))}, part=1e-6)
     found = measure(work, ONCE)["contenders"]
@@ -218,6 +228,14 @@ def test_the_exponent_of_growth_is_that_of_the_power_law(monkeypatch, power):
     assert growth.grown("pages", "warp")["exponent"] == pytest.approx(power)
 
 
+def test_a_turn_that_is_lucky_for_one_size_is_not_growth(monkeypatch):
+    axis = (2, 4, 8), lambda name, n: lambda: n, int
+    lucky = iter([2, 1, *[1] * 100])
+    monkeypatch.setitem(growth.AXES, "pages", axis)
+    monkeypatch.setattr(growth, "timed", lambda run: (run() / next(lucky), 0))
+    assert growth.grown("pages", "warp")["exponent"] == pytest.approx(1)
+
+
 def test_a_copy_reads_and_writes_as_many_bytes_as_it_says(monkeypatch):
     moved = []
     monkeypatch.setattr(machine.np, "copyto", lambda *pair: moved.append([a.nbytes for a in pair]))
@@ -243,7 +261,7 @@ def test_threads_of_a_work_that_fails_say_why():
 
 
 def test_charts_say_the_exponents_and_the_gain_of_threads(tmp_path):
-    found = {"counts": [1, 2000], "best_ms": [1.0, 2.0], "exponent": 0.125}
+    found = {"counts": [1, 2000], "median_ms": [1.0, 2.0], "exponent": 0.125}
     chart = tmp_path / "growth.svg"
     gained = {"counts": [1, 2, 3], "gain": {"scan, warp": [1.0, 1.9, 2.75]}}
     draw_growth({"pixels": {"warp": found}, "frames": {"opencl": found}}, gained, chart)
