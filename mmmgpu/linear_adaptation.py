@@ -65,13 +65,31 @@ def regress_means(
         off = total[own] / np.maximum(frames[own, None], 1) - models.mean[own]
         free, scale = _free(models, own, shape)  # (d, m, f), (d, f)
         pull = ridge * weight.sum(axis=0) / frames[own].sum()  # (d,) r v_j
-        weighted = np.swapaxes(free * weight.T[:, :, None], 1, 2)  # (d, f, m)
-        gram = weighted @ free
-        gram += (pull[:, None] * scale)[:, :, None] * np.eye(scale.shape[1])
-        right = weighted @ off.T[:, :, None]
-        change = np.linalg.solve(gram, right)[:, :, 0]  # w - w0
-        mean[own] += np.einsum("jmf,jf->mj", free, change)
+        mean[own] += _moved(free, weight.T, off.T, pull[:, None] * scale).T
     return mean
+
+
+def _moved(F: Array, v: Array, off: Array, held: Array) -> Array:
+    """F x of least sum of v (F x - off)^2 and held x^2, by dimension, (d, m).
+
+    Of the normal equations' two forms the smaller one: with B = sqrt(v) F and H = diag(held),
+
+        x = (B'B + H)^-1 B' sqrt(v) off = H^-1 B' (B H^-1 B' + I)^-1 sqrt(v) off.
+
+    Args:
+        F: shape (d, m, f). Where m < f nothing of `held` (d, f) is zero.
+        v, off: Weights and what to come near, of each phone, shape (d, m).
+    """
+    root = np.sqrt(v)[:, :, None]
+    B, right = root * F, root * off[:, :, None]
+    if F.shape[1] < F.shape[2]:
+        free = np.swapaxes(B / held[:, None], 1, 2)  # (d, f, m)
+        x = free @ np.linalg.solve(B @ free + np.eye(F.shape[1]), right)
+    else:
+        turned = np.swapaxes(B, 1, 2)
+        gram = turned @ B + held[:, :, None] * np.eye(F.shape[2])
+        x = np.linalg.solve(gram, turned @ right)
+    return np.asarray((F @ x)[:, :, 0])
 
 
 def _free(models: PhonemeModels, own: Rows, shape: Shape) -> tuple[Array, Array]:
