@@ -25,7 +25,7 @@ def draw_growth(growth, threads, path):
             for name, found in backends.items():
                 label = f"{name}: {found['exponent']:.2f}"
                 axes.loglog(found["counts"], found["median_ms"], "o-", ms=3, label=label)
-            axes.set(xlabel=axis, ylabel="best time [ms]")
+            axes.set(xlabel=axis, ylabel="median time [ms]")
             tick(axes.xaxis, found["counts"])
             axes.legend(title="exponent", frameon=False)
         draw_threads(last, threads)
