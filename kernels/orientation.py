@@ -15,6 +15,8 @@ from mmmgpu.kernels.lanes import (
 
 wp.set_module_options({"enable_backward": False})
 
+FOUR = wp.constant(4)  # frames in one loop; a loop for any number would keep its sums in memory
+
 
 @wp.func
 def near(off: vec16, distance: int):
@@ -66,46 +68,57 @@ def orient(
     frame = 2 * (area + LANES)
     for v in range(vectors):
         i = LANES * v
-        x0 = vec16()
-        y0 = vec16()
-        x1 = vec16()
-        y1 = vec16()
-        x2 = vec16()
-        y2 = vec16()
-        x3 = vec16()
-        y3 = vec16()
-        for k in range(firsts[m * vectors + v], firsts[m * vectors + v + 1]):
-            part = neighbours[k]
-            s = i + part[1] * pitch + part[0]
-            qx = get(own, LANES + 2 * m * area + s)
-            qy = get(own, LANES + (2 * m + 1) * area + s)
-            share = given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
-            at = there + s
-            x0 += missing(field, at, share, qx)
-            y0 += missing(field, at + area, share, qy)
-            if together > 1:
-                at += frame
-                x1 += missing(field, at, share, qx)
-                y1 += missing(field, at + area, share, qy)
-            if together > 2:
-                at += frame
-                x2 += missing(field, at, share, qx)
-                y2 += missing(field, at + area, share, qy)
-                at += frame
-                x3 += missing(field, at, share, qx)
-                y3 += missing(field, at + area, share, qy)
-        share = get(shares, m * area + i)
+        begin = firsts[m * vectors + v]
+        end = firsts[m * vectors + v + 1]
+        total = get(shares, m * area + i)
         to = here + i
-        put(residual, to, wp.cw_mul(share, x0))
-        put(residual, to + nodes, wp.cw_mul(share, y0))
-        if together > 1:
-            put(residual, to + 2 * nodes, wp.cw_mul(share, x1))
-            put(residual, to + 3 * nodes, wp.cw_mul(share, y1))
-        if together > 2:
-            put(residual, to + 4 * nodes, wp.cw_mul(share, x2))
-            put(residual, to + 5 * nodes, wp.cw_mul(share, y2))
-            put(residual, to + 6 * nodes, wp.cw_mul(share, x3))
-            put(residual, to + 7 * nodes, wp.cw_mul(share, y3))
+        if together == FOUR:
+            x0 = vec16()
+            y0 = vec16()
+            x1 = vec16()
+            y1 = vec16()
+            x2 = vec16()
+            y2 = vec16()
+            x3 = vec16()
+            y3 = vec16()
+            for k in range(begin, end):
+                part = neighbours[k]
+                s = i + part[1] * pitch + part[0]
+                qx = get(own, LANES + 2 * m * area + s)
+                qy = get(own, LANES + (2 * m + 1) * area + s)
+                share = given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
+                at = there + s
+                x0 += missing(field, at, share, qx)
+                y0 += missing(field, at + area, share, qy)
+                x1 += missing(field, at + frame, share, qx)
+                y1 += missing(field, at + frame + area, share, qy)
+                x2 += missing(field, at + 2 * frame, share, qx)
+                y2 += missing(field, at + 2 * frame + area, share, qy)
+                x3 += missing(field, at + 3 * frame, share, qx)
+                y3 += missing(field, at + 3 * frame + area, share, qy)
+            put(residual, to, wp.cw_mul(total, x0))
+            put(residual, to + nodes, wp.cw_mul(total, y0))
+            put(residual, to + 2 * nodes, wp.cw_mul(total, x1))
+            put(residual, to + 3 * nodes, wp.cw_mul(total, y1))
+            put(residual, to + 4 * nodes, wp.cw_mul(total, x2))
+            put(residual, to + 5 * nodes, wp.cw_mul(total, y2))
+            put(residual, to + 6 * nodes, wp.cw_mul(total, x3))
+            put(residual, to + 7 * nodes, wp.cw_mul(total, y3))
+        else:
+            for f in range(together):
+                x = vec16()
+                y = vec16()
+                for k in range(begin, end):
+                    part = neighbours[k]
+                    s = i + part[1] * pitch + part[0]
+                    qx = get(own, LANES + 2 * m * area + s)
+                    qy = get(own, LANES + (2 * m + 1) * area + s)
+                    share = given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
+                    at = there + f * frame + s
+                    x += missing(field, at, share, qx)
+                    y += missing(field, at + area, share, qy)
+                put(residual, to + 2 * f * nodes, wp.cw_mul(total, x))
+                put(residual, to + (2 * f + 1) * nodes, wp.cw_mul(total, y))
     for plane in range(2 * together):
         at = here + plane * nodes
         for row in range(rows[m], rows[m + 1]):
