@@ -98,10 +98,11 @@ def gain(key):
 
 
 def gain_beside_copy(key):
-    """What all threads gain over one, as a share of what a plain copy gains, the best backend."""
+    """What all threads gain over one, as a share of what a plain copy of as many bytes gains."""
 
     def value(results):
-        ours, copy = gain(key)(results), results.get("threads", {}).get("gain", {}).get(COPY)
+        gains = results.get("threads", {}).get("gain", {})
+        ours, copy = gain(key)(results), gains.get(f"{key}, {COPY}")
         return ours / copy[-1] if ours and copy else None
 
     return value

@@ -17,18 +17,19 @@ from mmmgpu.backends import default_threads
 from mmmgpu.bench import cases
 from mmmgpu.bench.kernels import on_backend
 from mmmgpu.bench.machine import COPIED, copy_of, product
-from mmmgpu.bench.timing import timed
+from mmmgpu.bench.timing import COPY, timed
 from mmmgpu.errors import InputError
 
 COMPUTE_BOUND = ("splat", "scan", "rbf")
-PARALLEL = (*COMPUTE_BOUND, "blend", "sample")
+MEMORY_BOUND = ("blend", "sample")  # beside a copy of as many bytes each
 MACHINE = {"copy": lambda: copy_of(2 * COPIED, default_threads()), "product": product}
 
 
-def measure_threads(backends, *, works=PARALLEL, turns=9):
+def measure_threads(backends, *, works=(*COMPUTE_BOUND, *MEMORY_BOUND), turns=9):
     """How many times faster each number of threads is than one, in all works and plain loops."""
     counts = up_to(default_threads())
-    names = [*MACHINE, *(f"{key}, {name}" for key in works for name in backends)]
+    names = [*MACHINE, *(f"{key}, {COPY}" for key in works if key in MEMORY_BOUND)]
+    names += [f"{key}, {name}" for key in works for name in backends]
     children = [start(n) for n in counts]
     try:
         gain = {
@@ -91,11 +92,12 @@ def answer():
 
 
 def made(name):
-    """What a name stands for, to be timed: of `MACHINE`, or a case and a backend."""
+    """What a name stands for, to be timed: of `MACHINE`, or a case and a backend or a copy."""
     if name in MACHINE:
         return MACHINE[name]()
-    key, backend = name.split(", ")
-    return on_backend(getattr(cases, key)(np.random.default_rng(0)), backend).load()
+    key, who = name.split(", ")
+    case = getattr(cases, key)(np.random.default_rng(0))
+    return copy_of(case.bytes, default_threads()) if who == COPY else on_backend(case, who).load()
 
 
 if __name__ == "__main__":

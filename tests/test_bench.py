@@ -203,7 +203,9 @@ def test_a_target_is_met_or_not_by_the_best_backend():
     assert values["blend, passes over its bytes"] == (1.11, True)
     assert values["backends apart by at most"] == (2.25, False)
     assert "analysis [frames/s]" not in found  # nothing was measured
-    results["threads"] = {"gain": {"copy": [1, 2], "sample, warp": [1, 1.9], "scan, warp": [1, 3]}}
+    results["threads"] = {
+        "gain": {"sample, copy": [1, 2], "sample, warp": [1, 1.9], "scan, warp": [1, 3]}
+    }
     values = {name: (t["value"], t["met"]) for name, t in judge_targets(results).items()}
     assert values["threads, sample, of a copy's gain"] == (0.95, True)
     assert values["threads, distance_scan"] == (3, True)
@@ -251,7 +253,7 @@ def test_more_threads_take_turns_with_one(monkeypatch):
     monkeypatch.setenv("MMMGPU_THREADS", "2")
     found = threads.measure_threads(["opencl"], works=["blend"], turns=1)
     assert found["counts"] == [1, 2]
-    assert found["gain"].keys() == {"copy", "product", "blend, opencl"}
+    assert found["gain"].keys() == {"copy", "product", "blend, copy", "blend, opencl"}
     assert all(one == 1 < 10 * more for one, more in found["gain"].values())
 
 
