@@ -46,9 +46,9 @@ def faster_than(key, peer):
     """How many times faster than a peer the best of ours is."""
 
     def value(results):
-        ours = rows_of(results, key, *BACKENDS, "adjoint")
         theirs = rows_of(results, key, peer)
-        return max((ratio(their, our) for their in theirs for our in ours), default=None)
+        ours = rows_of(results, key, *BACKENDS, "adjoint") if theirs else ()
+        return max((min(ratio(their, our) for their in theirs) for our in ours), default=None)
 
     return value
 
@@ -68,8 +68,8 @@ def of_one_pass(key):
 
     def value(results):
         copies = rows_of(results, key, COPY)
-        ours = rows_of(results, key, *BACKENDS)
-        return min((ratio(our, copy) for our in ours for copy in copies), default=None)
+        ours = rows_of(results, key, *BACKENDS) if copies else ()
+        return min((ratio(our, copies[0]) for our in ours), default=None)
 
     return value
 
@@ -88,11 +88,15 @@ def steepest(results):
 
 
 def gain(key):
-    """What all threads gain over one, the best backend."""
+    """What all threads gain over one, the backend that is fastest with all of them."""
 
     def value(results):
         gains = results.get("threads", {}).get("gain", {})
-        return max((gains[k][-1] for b in BACKENDS if (k := f"{key}, {b}") in gains), default=None)
+        there = [b for b in BACKENDS if f"{key}, {b}" in gains]
+        if not there:
+            return None
+        best = min(there, key=lambda b: [row["median_ms"] for row in rows_of(results, key, b)])
+        return gains[f"{key}, {best}"][-1]
 
     return value
 

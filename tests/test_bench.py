@@ -211,6 +211,14 @@ def test_a_target_is_met_or_not_by_the_best_backend():
     assert values["threads, distance_scan"] == (3, True)
 
 
+def test_the_gain_of_threads_is_that_of_the_faster_backend():
+    """The other may gain more because one thread had the worse turns."""
+    results = run_of(warp=9, opencl=4)
+    results["works"]["scan"] = results["works"]["blend"] | {"items": 1}
+    results["threads"] = {"gain": {"scan, warp": [1, 2.5], "scan, opencl": [1, 1.8]}}
+    assert judge_targets(results)["threads, distance_scan"]["value"] == 1.8
+
+
 @pytest.mark.parametrize(
     ("theirs", "value"), [([5, 4.4, 11], 1.1), ([5], 1.25)], ids=["in turns", "one turn"]
 )

@@ -37,6 +37,7 @@ NO_PLATFORM = (
     "or use --backend warp"
 )
 NO_MEMORY = {
+    cl.status_code.MAP_FAILURE,
     cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
     cl.status_code.OUT_OF_HOST_MEMORY,
     cl.status_code.OUT_OF_RESOURCES,
@@ -188,6 +189,7 @@ class OpenCL(Launches):
         return np.asarray(host)
 
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
+        """Of more than `KEPT` bytes on a CPU it is mapped, which waits for what is queued."""
         kind = np.dtype(dtype)
         size = math.prod(shape) * kind.itemsize
         with _faults_of(self.name):

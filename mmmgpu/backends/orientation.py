@@ -174,47 +174,47 @@ def _filling(valid: NDArray[np.bool_]) -> tuple[_Rows, _Rows]:
     y, x = _divided(np.arange(h * w), w)
     inside = valid.ravel()
     empty = np.flatnonzero(~inside)
-    needs: Entries = np.arange(len(empty)), empty, np.ones(len(empty))  # of holes, in empty cells
-    cells: list[Entries] = [_NONE]
-    through: list[Entries] = [_NONE]
+    hole, top, left = np.arange(len(empty)), y[empty], x[empty]
+    needs = np.zeros((len(empty), 3, 3))  # of holes, in the 3 x 3 cells from top left on
+    needs[:, 0, 0] = 1
+    cells = [(hole[:0], hole[:0], np.empty(0))]
+    through = [(hole[:0], hole[:0], np.empty(0))]
     level, count = 0, 0
-    while len(needs[0]):
-        needs = _coarser(needs, h, w)
+    while len(hole):
+        (rows, top), (columns, left) = _coarser(top, h), _coarser(left, w)
+        needs = rows.swapaxes(1, 2) @ needs @ columns
         level, h, w = level + 1, (h + 1) // 2, (w + 1) // 2
         cell = (y >> level) * w + (x >> level)
         number = np.bincount(cell[inside], minlength=h * w)
-        full = number[needs[1]] > 0
-        used = np.unique(needs[1][full])
+        k, down, right = np.nonzero(needs)
+        by = (top[k] + down) * w + left[k] + right
+        full = number[by] > 0
+        k, down, right, by = k[full], down[full], right[full], by[full]
+        used = np.unique(by)
         place = np.full(h * w, -1)
         place[used] = np.arange(count, count + len(used))
         count += len(used)
         member = np.flatnonzero(inside & (place[cell] >= 0))
         cells.append((place[cell[member]], member, 1 / number[cell[member]]))
-        hole, by, share = needs
-        through.append((hole[full], place[by[full]], share[full]))
-        needs = hole[~full], by[~full], share[~full]
+        through.append((hole[k], place[by], needs[k, down, right]))
+        needs[k, down, right] = 0
+        more = needs.any(axis=(1, 2))
+        hole, top, left, needs = hole[more], top[more], left[more], needs[more]
     return _in_rows(cells, count), _in_rows(through, len(empty))
 
 
-_NONE: Entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+def _coarser(first: Numbers, number: int) -> tuple[Floats, Numbers]:
+    """Three neighbours of a row of `number`, interpolated from three of the next coarser one.
 
-
-def _coarser(needs: Entries, h: int, w: int) -> Entries:
-    """What holes need of cells of h x w, each interpolated from the next coarser level."""
-    hole, cell, share = needs
-    rows, columns = (h + 1) // 2, (w + 1) // 2
-    y, x = _divided(cell, w)
-    y0, x0 = y // 2, x // 2
-    y1 = np.clip(y0 + 2 * (y % 2) - 1, 0, rows - 1)
-    x1 = np.clip(x0 + 2 * (x % 2) - 1, 0, columns - 1)
-    four = [y0 * columns + x0, y0 * columns + x1, y1 * columns + x0, y1 * columns + x1]
-    key = np.concatenate([hole * (rows * columns) + by for by in four])
-    order = np.argsort(key)
-    key = key[order]
-    starts = np.flatnonzero(np.diff(key, prepend=-1))
-    shares = np.concatenate([part * share for part in (0.5625, 0.1875, 0.1875, 0.0625)])
-    hole, cell = _divided(key[starts], rows * columns)
-    return hole, cell, np.add.reduceat(shares[order], starts)
+    first: number of the first neighbour, (n,): -1 or more. Their shares, (n, 3 fine, 3 coarse), and
+    the first coarse one.
+    """
+    fine = first[:, None] + np.arange(3)
+    near = fine // 2
+    far = np.clip(near + 2 * (fine % 2) - 1, 0, (number + 1) // 2 - 1)
+    begin = (first - 1) // 2
+    coarse = begin[:, None, None] + np.arange(3)
+    return 0.75 * (near[:, :, None] == coarse) + 0.25 * (far[:, :, None] == coarse), begin
 
 
 def _in_rows(parts: Sequence[Entries], number: int) -> _Rows:
