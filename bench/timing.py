@@ -158,8 +158,9 @@ def timed(run):
 
 
 def statistics(seconds, processor):
-    """All turns, median, quartiles and best [ms]; the least of the processor's time, which other
-    work slows least.
+    """Every turn, median, quartiles and best [ms]; the least of the processor's time.
+
+    Other work slows that least.
     """
     low, median, high = np.percentile(seconds, [25, 50, 75])
     return {

@@ -37,6 +37,14 @@ def given(share: vec16, lanes: int):
 
 
 @wp.func
+def arriving(part: wp.vec3i, own: wp.array[float], x: int, y: int):
+    """The flow of 16 sources of a part, read at `x` and `y`, and the share of it that arrives."""
+    qx = get(own, x)
+    qy = get(own, y)
+    return qx, qy, given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
+
+
+@wp.func
 def missing(field: wp.array[float], at: int, share: vec16, q: vec16):
     """A share of the flow that is missing at a pixel, in one direction and frame."""
     return wp.cw_mul(share, get(field, at) - q)
@@ -66,6 +74,8 @@ def orient(
     """The flow that is missing to prototype `m`, for each of its pixels, in 1, 2 or 4 frames."""
     vectors = area / LANES
     frame = 2 * (area + LANES)
+    x_plane = LANES + 2 * m * area
+    y_plane = x_plane + area
     for v in range(vectors):
         i = LANES * v
         begin = firsts[m * vectors + v]
@@ -84,9 +94,7 @@ def orient(
             for k in range(begin, end):
                 part = neighbours[k]
                 s = i + part[1] * pitch + part[0]
-                qx = get(own, LANES + 2 * m * area + s)
-                qy = get(own, LANES + (2 * m + 1) * area + s)
-                share = given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
+                qx, qy, share = arriving(part, own, x_plane + s, y_plane + s)
                 at = there + s
                 x0 += missing(field, at, share, qx)
                 y0 += missing(field, at + area, share, qy)
@@ -111,9 +119,7 @@ def orient(
                 for k in range(begin, end):
                     part = neighbours[k]
                     s = i + part[1] * pitch + part[0]
-                    qx = get(own, LANES + 2 * m * area + s)
-                    qy = get(own, LANES + (2 * m + 1) * area + s)
-                    share = given(wp.cw_mul(near(qx, part[0]), near(qy, part[1])), part[2])
+                    qx, qy, share = arriving(part, own, x_plane + s, y_plane + s)
                     at = there + f * frame + s
                     x += missing(field, at, share, qx)
                     y += missing(field, at + area, share, qy)

@@ -85,7 +85,8 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
     inside = around((basis.w_t > MOUTH) | (basis.w_f > LIP))
     basis = cut(basis, inside)
     pixels = np.flatnonzero((basis.w_f > LIP) & chessboard(basis.w_f.shape))
-    weight, w = basis.w_f.ravel()[pixels], basis.w_f.shape[1]
+    weight = basis.w_f.ravel()[pixels]
+    y, x = np.unravel_index(pixels, basis.w_f.shape)
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
     along = np.ascontiguousarray(moving.transpose(2, 1, 0).reshape(2 * len(pixels), -1))
     weighted = along * np.sqrt(np.tile(weight, 2))[:, None]
@@ -105,7 +106,7 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
         held=kernels.hold_prototypes(basis.images, basis.flows, HOLE),
         pixels=pixels,
         weight=weight,
-        places=np.stack([pixels % w, pixels // w], axis=1).astype(np.float32),
+        places=np.stack([x, y], axis=1).astype(np.float32),
         along=along,
         gram=cho_factor(regular),
         everywhere=planes(np.maximum(root, UNSEEN)[..., None])[0],

@@ -144,8 +144,9 @@ class Frames:
         take: Given a frame in full, its clip and its place in it.
         """
         wanted = np.unique(np.fromiter(numbers, np.int64))
-        parts = np.split(wanted, np.searchsorted(wanted, self._ends))[:-1]
-        jobs = [job for job in zip(self.clips, self._ends, parts, strict=True) if len(job[2])]
+        ends = self._ends
+        parts = np.split(wanted, np.searchsorted(wanted, ends))[:-1]
+        jobs = [job for job in zip(self.clips, ends, parts, strict=True) if len(job[2])]
 
         def read(job: tuple[Clip, int, NDArray[np.int64]], cancelled: Cancelled) -> list[T]:
             clip, end, own = job
