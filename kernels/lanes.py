@@ -38,6 +38,12 @@ def address(values: wp.array[float], i: int):
 
 
 @wp.func
+def vector_at(address: wp.uint64):
+    here = wp.array(ptr=address, shape=(1,), dtype=vec16)
+    return here[0]
+
+
+@wp.func
 def one_at(address: wp.uint64):
     here = wp.array(ptr=address, shape=(1,), dtype=float)
     return here[0]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         evaluate_rbf,
         fill_holes,
         forward_warp,
+        normal_equations,
         piecewise_warp,
         sample,
     )
@@ -53,6 +54,7 @@ __all__ = [
     "forward_warp",
     "get_backend",
     "load",
+    "normal_equations",
     "performer",
     "piecewise_warp",
     "rbf_correspondence",
@@ -82,6 +84,7 @@ _HOMES = {
         "evaluate_rbf",
         "fill_holes",
         "forward_warp",
+        "normal_equations",
         "piecewise_warp",
         "sample",
     ],

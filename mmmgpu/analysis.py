@@ -147,10 +147,10 @@ def analyze(analyzer: Analyzer, image: F32) -> tuple[Floats, Floats]:
         beta, made = _fit_texture(analyzer, wanted, flow, used)
         alpha = _refine(analyzer, image, alpha, flow, made)
         used = np.flatnonzero(beta > NO_TEXTURE)
-    every = np.arange(len(analyzer.thumbnails))
     flow = analyzer.basis.flow(alpha)
-    warped = _warped(analyzer, flow, every, analyzer.masked)
-    return alpha, _fit_beta(analyzer, wanted, warped, every, analyzer.masked)
+    every = np.arange(len(analyzer.thumbnails))
+    moved = _moved(analyzer, flow, every, analyzer.masked)
+    return alpha, _fit_beta(analyzer, wanted, moved, every, analyzer.masked)
 
 
 def _flow_to(analyzer: Analyzer, image: F32, nearest: int) -> F32:
@@ -210,29 +210,29 @@ def _fit_texture(
     analyzer: Analyzer, wanted: F32, flow: F32, used: NDArray[np.int64]
 ) -> tuple[Floats, F32]:
     """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3); `wanted` as planes."""
-    scale = analyzer.everywhere
-    warped = _warped(analyzer, flow, used, scale)
-    beta = _fit_beta(analyzer, wanted, warped, used, scale)
-    mixed = (beta[used].astype(np.float32) @ warped).reshape(wanted.shape)
-    width = flow.shape[1]
+    k, scale = analyzer.kernels, analyzer.everywhere
+    moved = _moved(analyzer, flow, used, scale)
+    beta = _fit_beta(analyzer, wanted, moved, used, scale)
+    shares = k.to_device(beta[None, used].astype(np.float32))
+    mixed, width = k.to_host(k.blend(moved, shares))[0], flow.shape[1]
     return beta, picture(mixed[..., :width] / scale[:, :width], width)
 
 
-def _warped(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: F32) -> F32:
-    """The prototypes `used` (n,) along `flow`, scaled, as planes: (n, 3 h pitch)."""
+def _moved(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: F32) -> Any:
+    """On the device: the prototypes `used` (n,) along `flow`, scaled, (n, 3, h, pitch)."""
     k = analyzer.kernels
-    to, which, how = map(k.to_device, (planes(flow[None]), used.astype(np.int32), scale))
-    moved = k.move_prototypes(analyzer.held, to, which, how)
-    return k.to_host(moved).reshape(len(used), -1)
+    to, how = map(k.to_device, (planes(flow[None]), scale))
+    return k.move_prototypes(analyzer.held, to, used, how)
 
 
 def _fit_beta(
-    analyzer: Analyzer, wanted: F32, warped: F32, used: NDArray[np.int64], scale: F32
+    analyzer: Analyzer, wanted: F32, moved: Any, used: NDArray[np.int64], scale: F32
 ) -> Floats:
-    """beta (M,), zero outside `used`; warped: what `_warped` gives for `scale`."""
-    scaled = (wanted * scale).ravel()
+    """beta (M,), zero outside `used`; moved: what `_moved` gives for `scale`."""
+    k = analyzer.kernels
+    products = k.to_host(k.normal_equations(moved, k.to_device(wanted * scale)))
     beta = np.zeros(len(analyzer.thumbnails))
-    beta[used] = solve_simplex(warped @ warped.T, warped @ scaled)
+    beta[used] = solve_simplex(products[:-1], products[-1])
     return beta
 
 

@@ -169,17 +169,17 @@ def texture_coordinates(
     kernels = get_backend(backend)
     root = np.where(source.w_t > MOUTH, np.sqrt(source.w_t), 0).astype(np.float32)[..., None]
     scale = kernels.to_device(planes(root)[0])
-    wanted = planes(source.images * root).reshape(len(view), -1)
-    every, beta = np.arange(len(view), dtype=np.int32), np.zeros((len(view), len(view)))
+    wanted = planes(source.images * root)
+    every, beta = np.arange(len(view)), np.zeros((len(view), len(view)))
     for r, v in enumerate(views):
         mine = np.flatnonzero(view == r)
         held = kernels.hold_prototypes(source.images, v.flows_a, HOLE) if len(mine) else None
         for k in mine:
             others = every[every != k]
-            flow, used = map(kernels.to_device, (planes(v.flows_a[k : k + 1]), others))
-            moved = kernels.to_host(kernels.move_prototypes(held, flow, used, scale))
-            a = moved.reshape(len(others), -1)
-            beta[others, k] = solve_simplex(a @ a.T, a @ wanted[k])
+            flow, image = map(kernels.to_device, (planes(v.flows_a[k : k + 1]), wanted[k]))
+            moved = kernels.move_prototypes(held, flow, others, scale)
+            products = kernels.to_host(kernels.normal_equations(moved, image))
+            beta[others, k] = solve_simplex(products[:-1], products[-1])
     return beta
 
 
@@ -235,8 +235,8 @@ class _TextureScan:
         for frames, held in self._hold(r, np.flatnonzero(weights.any(axis=0))):
             shares = weights[:, frames]
             some = np.flatnonzero(shares.any(axis=1))
-            moved, mixed = map(k.to_device, (flows[some], shares[some]))
-            part: F32 = k.to_host(k.mix_prototypes(held, moved, mixed, everywhere))
+            to = k.to_device(flows[some])
+            part: F32 = k.to_host(k.mix_prototypes(held, to, shares[some], everywhere))
             made[some] += part
         width = self._target.w_t.shape[1]
         return np.stack([self._seen(picture(one, width)) for one in made])

@@ -111,6 +111,39 @@ def blend(images: ArrayLike, weights: ArrayLike, *, backend: str = "warp") -> F3
     return _joined(in_parts(mixed, math.prod(w.shape[:-1]))).reshape(shape)
 
 
+def normal_equations(
+    images: ArrayLike, wanted: ArrayLike, *, backend: str = "warp"
+) -> tuple[F32, F32]:
+    """What is to be solved for the weights with which images add up to `wanted`, or nearly.
+
+        G[m, n] = sum images[m] images[n],   h[m] = sum images[m] wanted,
+
+    over all pixels and channels: |sum_m b[m] images[m] - wanted|^2 is b' G b - 2 h' b and a
+    constant. The quadratic programme of analysis has these.
+
+    Args:
+        images: Values of any unit, shape (M, H, W, C).
+        wanted: An image of the same unit, shape (H, W, C).
+        backend: A name for `mmmgpu.backends.get_backend`.
+
+    Returns:
+        The Gram matrix G, shape (M, M), and h, shape (M,), in the unit squared.
+    """
+    i = as_float32("images", images, "M", "H", "W", "C")
+    w = as_float32("wanted", wanted, *i.shape[1:])
+    number, k = len(i), get_backend(backend)
+    if not i.size:
+        return np.zeros((number, number), np.float32), np.zeros(number, np.float32)
+    rows, flat = i.reshape(number, -1), w.ravel()
+
+    def multiplied(part: slice) -> F32:
+        here = np.ascontiguousarray(rows[:, part])
+        return k.to_host(k.normal_equations(*_on_device(k, here, flat[part])))
+
+    products = np.stack(in_parts(multiplied, w.size)).sum(axis=0, dtype=np.float64)
+    return products[:-1].astype(np.float32), products[-1].astype(np.float32)
+
+
 def sample(field: ArrayLike, points: ArrayLike, *, backend: str = "warp") -> F32:
     """Bilinear samples of `field` at `points`, the border clamped.
 

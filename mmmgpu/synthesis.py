@@ -107,7 +107,7 @@ def synthesize_batch(synthesizer: Synthesizer, alpha: Floats, beta: Floats) -> F
     weights = np.where(beta > NO_TEXTURE, beta, 0)
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
     flows = k.blend(s.flows, k.to_device(alpha.astype(np.float32)))
-    mixed = k.mix_prototypes(s.held, flows, k.to_device(weights), s.scale)
+    mixed = k.mix_prototypes(s.held, flows, weights, s.scale)
     made = np.tile(s.outside, (len(alpha), 1, 1, 1))
     for image, one in zip(made, k.to_host(mixed), strict=True):
         part = image[s.inside]

@@ -66,6 +66,20 @@ def blend(images, weights):
     return total
 
 
+def normal_equations(images, wanted):
+    """Every product a running sum over the values."""
+    rows = [image.ravel().tolist() for image in images]
+    return tuple(
+        np.array(
+            [
+                [sum(a * b for a, b in zip(row, other, strict=True)) for other in others]
+                for row in rows
+            ]
+        )
+        for others in (rows, [wanted.ravel().tolist()])
+    )
+
+
 def sample(field, points):
     """Samples (N, C) of one field at points (N, 2)."""
     height, width, _ = field.shape

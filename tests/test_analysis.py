@@ -8,6 +8,7 @@ from worlds import POSTURES, hold, mouth_pictures
 
 from mmmgpu.analysis import (
     FLOW_RIDGE,
+    STEPS,
     TEXTURE_RIDGE,
     analyze,
     fit_flow,
@@ -208,6 +209,23 @@ def test_both_backends_find_the_same(basis, analyzer, backend):
     got = analyze(prepare_analysis(basis, get_backend(backend)), image)
     for a, b in zip(got, wanted, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
+
+
+def test_no_moved_prototypes_are_brought_to_the_host(basis, backend, monkeypatch):
+    """Only what is solved for beta, and the one picture that a step looks at."""
+    kernels = get_backend(backend)
+    analyzer = prepare_analysis(basis, kernels)
+    fetch, fetched = type(kernels).to_host, []
+
+    def watched(self, array):
+        fetched.append(tuple(array.shape))
+        return fetch(self, array)
+
+    monkeypatch.setattr(type(kernels), "to_host", watched)
+    analyze(analyzer, basis.images[1])
+    pictures = [shape for shape in fetched if len(shape) > 2]
+    assert pictures == [(1, 3, *analyzer.masked.shape)] * STEPS
+    assert (6, 5) in fetched  # the equations of all five
 
 
 def test_beta_explains_the_pixels_of_the_mask_and_no_others(basis, analyzer, kernels):

@@ -28,12 +28,13 @@ warped, weight = o.forward_warp(field, flow, backend=backend)
 alone, _ = o.forward_warp(field[0], flow[0], backend=backend)
 filled = o.fill_holes(warped, weight, threshold=0.3, backend=backend)
 blended = o.blend(filled, rng.random((3, 5)), backend=backend)
+products = o.normal_equations(filled, field[0], backend=backend)
 sampled = o.sample(filled, flow * 9, backend=backend)
 rows = field.reshape(5, -1, 6)
 scanned = o.distance_scan(rows, np.tile(rows, (9, 1, 1)), rng.random(1320), backend=backend)
 plane = [[1, 2, 3], [4, 5, 6]]
 mapped = o.evaluate_rbf(flow * 9, rows[0, :7, :2], rows[1, :7, :2], plane, 0.3, backend=backend)
-results = warped, weight, alone, filled, blended, sampled, scanned, mapped
+results = warped, weight, alone, filled, blended, *products, sampled, scanned, mapped
 print(hashlib.sha256(b"".join(r.tobytes() for r in results)).hexdigest())
 """
 
@@ -198,13 +199,15 @@ def test_every_output_is_written_and_no_scratch_is_read_before(backend, monkeypa
         k, rng.random((2, 9)), rng.normal(0, 1, (9, 42, 5)), rng.random(42)
     )
     centres, plane = on_device(k, rng.normal(0, 1, (19, 2)), rng.normal(0, 1, (2, 3)))
+    (one,) = on_device(k, rng.normal(0, 1, (42, 5)))
 
     def everything():
         warped, weight = k.forward_warp(field, flow)
         filled = k.fill_holes(warped, weight, 0.4)
         rest = k.blend(filled, weights), k.distance_scan(rows, rows, shares)
+        products = k.normal_equations(rows, one)
         mapped = k.evaluate_rbf(centres, centres, centres, plane, 0.1)
-        return [k.to_host(a).copy() for a in (warped, weight, filled, *rest, mapped)]
+        return [k.to_host(a).copy() for a in (warped, weight, filled, *rest, products, mapped)]
 
     clean = everything()
     empty = type(k).empty

@@ -125,6 +125,10 @@ MANY = {  # what is long along the axis that can be cut
         "threshold": 0.2,
     },
     "blend": {"weights": RNG.random((40, 2), np.float32)},
+    "normal_equations": {  # sums of whole numbers are exact in any order
+        "images": RNG.integers(0, 9, (3, 40, 30, 3)),
+        "wanted": RNG.integers(0, 9, (40, 30, 3)),
+    },
     "sample": {"field": RNG.random((7, 9, 8, 3), np.float32), "points": np.ones((7, 4, 2))},
     "distance_scan": {
         "queries": RNG.random((2, 20, 2), np.float32),

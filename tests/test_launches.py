@@ -34,8 +34,8 @@ def some_of(size, rng):
 def moved(name, images, flows, flow, used, scale, threads=None):
     k = get_backend(name, threads)
     held = k.hold_prototypes(images, flows, HOLE)
-    given = planes(flow[None]), np.int32(used), planes(scale[..., None])[0]
-    made = k.to_host(k.move_prototypes(held, *map(k.to_device, given)))
+    to, how = map(k.to_device, (planes(flow[None]), planes(scale[..., None])[0]))
+    made = k.to_host(k.move_prototypes(held, to, np.array(used, int), how))
     return np.moveaxis(made[..., : images.shape[2]], 1, -1)
 
 
@@ -45,8 +45,8 @@ def mixed(name, *given, threads=None):
 
 def mix(k, images, flows, wanted, weights, scale):
     held = k.hold_prototypes(images, flows, HOLE)
-    given = planes(wanted), np.float32(weights), planes(scale[..., None])[0]
-    made = k.to_host(k.mix_prototypes(held, *map(k.to_device, given)))
+    to, how = map(k.to_device, (planes(wanted), planes(scale[..., None])[0]))
+    made = k.to_host(k.mix_prototypes(held, to, np.float32(weights), how))
     return np.moveaxis(made[..., : images.shape[2]], 1, -1)
 
 

@@ -22,6 +22,7 @@ CALLS = {
     "forward_warp": {"field": ONES, "flow": FLOW},
     "fill_holes": {"field": ONES, "weight": ONES[..., 0]},
     "blend": {"images": ONES, "weights": ONES[..., 0, 0, :2]},
+    "normal_equations": {"images": ONES, "wanted": ONES[0]},
     "sample": {"field": ONES, "points": POINTS},
     "distance_scan": {"queries": ONES[0], "corpus": ONES[1], "weights": ONES[0, 0, :, 0]},
     "evaluate_rbf": {
@@ -160,6 +161,10 @@ def test_scans_and_blends_of_nothing(backend):
     assert call("distance_scan", backend, queries=nothing).shape == (0, 4)
     assert call("distance_scan", backend, corpus=nothing).shape == (4, 0)
     assert_array_equal(call("blend", backend, images=ONES[:0], weights=np.ones((2, 0))), 0 * ONES)
+    gram, right = call("normal_equations", backend, images=ONES[:0])
+    assert (gram.shape, right.shape) == ((0, 0), (0,))
+    gram, right = call("normal_equations", backend, images=ONES[:, :0], wanted=ONES[0, :0])
+    assert_array_equal(np.vstack([gram, right]), np.zeros((3, 2)))
 
 
 def test_a_field_without_a_valid_pixel_is_an_error_that_says_which(backend):

@@ -95,6 +95,15 @@ def test_the_reference_blends_samples_and_scans_as_the_loops_do():
     )
 
 
+def test_the_reference_multiplies_as_the_loops_do():
+    rng = np.random.default_rng(0)
+    images, wanted = rng.normal(0, 1, (3, 5, 4, 2)), rng.normal(0, 1, (5, 4, 2))
+    gram, right = operations.normal_equations(images, wanted, backend="numpy")
+    desired, column = oracles.normal_equations(images, wanted)
+    assert_close(gram, desired)
+    assert_close(right, column[:, 0])
+
+
 def mesh(rng, points, pixels):
     """Triangles, and pixels in them: also at corners, and outside by a little."""
     triangles = rng.integers(0, points, (7, 3))
@@ -188,6 +197,36 @@ def test_blend_of_many_images_whose_sum_grows_large_and_cancels(backend):
     weights = np.concatenate([half, -half[::-1]])
     actual = operations.blend(images, weights, backend=backend)
     assert_close(actual, operations.blend(images, weights, backend="numpy"))
+
+
+def assert_same_equations(images, wanted, backend):
+    actual = operations.normal_equations(images, wanted, backend=backend)
+    desired = operations.normal_equations(images, wanted, backend="numpy")
+    for a, d in zip(actual, desired, strict=True):
+        assert_close(a, d)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 8, 46])
+@pytest.mark.parametrize("size", [*SIZES, (96, 80)])
+def test_normal_equations(backend, size, number):
+    rng = np.random.default_rng(number)
+    images, wanted = rng.normal(0, 1, (number, *size, 3)), rng.normal(0, 1, (*size, 3))
+    assert_same_equations(images, wanted, backend)
+
+
+def test_normal_equations_of_large_equal_pictures(backend):
+    """Adding one number many times is where a float32 sum drifts most."""
+    assert_same_equations(np.full((2, *LARGE, 3), 0.3), np.full((*LARGE, 3), 0.7), backend)
+
+
+def test_equal_images_have_equal_products(backend):
+    """To the bit, wherever they stand, as do those of an image and an equal one that is wanted."""
+    images = np.random.default_rng(0).random((11, 13, 7, 3))
+    images[8] = images[2]
+    gram, right = operations.normal_equations(images, images[5], backend=backend)
+    assert_array_equal(gram, gram.T)
+    assert_array_equal(gram[8], gram[2])
+    assert_array_equal(right, gram[5])
 
 
 @pytest.mark.parametrize("channels", range(1, 9))

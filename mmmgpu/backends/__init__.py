@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
@@ -50,6 +51,9 @@ class Backend(Protocol):
     def blend(self, images: Any, weights: Any, /) -> Any:
         """(M, H, W, C), (B, M) -> (B, H, W, C)."""
 
+    def normal_equations(self, images: Any, wanted: Any, /) -> Any:
+        """(M, ...), (...) of as many values -> (M + 1, M): the Gram matrix, then the right side."""
+
     def sample(self, field: Any, points: Any, /) -> Any:
         """(B, H, W, C), (B, N, 2) -> (B, N, C)."""
 
@@ -68,15 +72,15 @@ class Backend(Protocol):
         CE05, Eq. 2, is filled.
         """
 
-    def move_prototypes(self, held: Any, flow: Any, used: Any, scale: Any, /) -> Any:
+    def move_prototypes(self, held: Any, flow: Any, used: NDArray[np.int64], scale: Any, /) -> Any:
         """Some of what `hold_prototypes` gave, each moved along C_syn as in CE05, Eq. 2, scaled.
 
-        (1, 2, H, P), (n,) int32, (H, P) -> (n, 3, H, P): planes, see `mmmgpu.backends.planes`.
+        (1, 2, H, P), NumPy (n,), (H, P) -> (n, 3, H, P): planes, see `mmmgpu.backends.planes`.
         Where the scale is 0 nothing is filled.
         """
 
-    def mix_prototypes(self, held: Any, flows: Any, weights: Any, scale: Any, /) -> Any:
-        """CE05, Eq. 2, scaled: (B, 2, H, P), (B, M), (H, P) -> (B, 3, H, P).
+    def mix_prototypes(self, held: Any, flows: Any, weights: F32, scale: Any, /) -> Any:
+        """CE05, Eq. 2, scaled: (B, 2, H, P), NumPy (B, M), (H, P) -> (B, 3, H, P).
 
         A prototype costs nothing where its weight is 0; else as `move_prototypes`.
         """

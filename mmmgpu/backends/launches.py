@@ -27,6 +27,7 @@ MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
 TOGETHER = 4, 2, 1  # mixtures whose flows are re-oriented at once: as many as there are enough of
 TILE = 64  # corpus rows packed at a time
 QUERIES, ROWS = 2, 4  # of one thread of kernels/distance_scan
+PIECE, BLOCK = 1024, 4  # values and rows of one thread of kernels/normal_equations
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,17 @@ class Launches(ABC):
         self.launch_all("blend.blend_rest", batch * (size % LANES), inputs, [blended])
         return blended
 
+    def normal_equations(self, images: Any, wanted: Any) -> Any:
+        number, size = images.shape[0], math.prod(images.shape[1:])
+        pieces, blocks = math.ceil(size / PIECE), number // BLOCK + 1
+        parts = self.empty(pieces, number + 1, number)
+        products = self.empty(number + 1, number)
+        count = pieces * (blocks * (blocks + 1) // 2)
+        self.launch_all("normal_equations.multiply", count, [images, wanted, number, size], [parts])
+        inputs, count = [parts, pieces, number], (number + 1) * number
+        self.launch_all("normal_equations.add_up", count, inputs, [products])
+        return products
+
     def sample(self, field: Any, points: Any) -> Any:
         fields, height, width, channels = field.shape
         sets, number, _ = points.shape
@@ -194,18 +206,18 @@ class Launches(ABC):
         arrays = tuple(self.to_device(a) for a in (textures, *parts, *rows))
         return Prototypes(arrays, number, height, width, held.nodes, float(hole))
 
-    def move_prototypes(self, held: Prototypes, flow: Any, used: Any, scale: Any) -> Any:
-        members = self.to_host(used)
-        alone = [np.arange(len(members) + 1), members, np.ones((len(members), 1))]
-        return self._mixtures(held, flow, 1, len(members), alone, scale)
+    def move_prototypes(
+        self, held: Prototypes, flow: Any, used: NDArray[np.int64], scale: Any
+    ) -> Any:
+        alone = [np.arange(len(used) + 1), used, np.ones((len(used), 1))]
+        return self._mixtures(held, flow, 1, len(used), alone, scale)
 
-    def mix_prototypes(self, held: Prototypes, flows: Any, weights: Any, scale: Any) -> Any:
-        shares = self.to_host(weights)
-        mixtures, number = shares.shape
+    def mix_prototypes(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
+        mixtures, number = weights.shape
         together = next(n for n in TOGETHER if n == 1 or mixtures >= n * self.workers)
         groups = math.ceil(mixtures / together)
         padded = np.zeros((groups, together, number), np.float32)
-        padded.reshape(-1, number)[:mixtures] = shares
+        padded.reshape(-1, number)[:mixtures] = weights
         used = padded.any(axis=1)
         parts = np.concatenate([[0], np.cumsum(np.count_nonzero(used, axis=1))])
         members = [parts, np.nonzero(used)[1], padded.transpose(0, 2, 1)[used]]

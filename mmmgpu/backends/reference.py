@@ -61,6 +61,10 @@ class Reference:
     def blend(self, images: F32, weights: F32) -> F32:
         return np.tensordot(weights.astype(np.float64), images, axes=1).astype(np.float32)
 
+    def normal_equations(self, images: F32, wanted: F32) -> F32:
+        rows = images.reshape(len(images), wanted.size).astype(np.float64)
+        return np.vstack([rows @ rows.T, rows @ wanted.ravel()]).astype(np.float32)
+
     def sample(self, field: F32, points: F32) -> F32:
         batch = max(len(field), len(points))
         gathered = [_gather(field[b % len(field)], points[b % len(points)]) for b in range(batch)]
@@ -86,7 +90,9 @@ class Reference:
     def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
         return Prototypes(images, flows, hole)
 
-    def move_prototypes(self, held: Prototypes, flow: F32, used: I32, scale: F32) -> F32:
+    def move_prototypes(
+        self, held: Prototypes, flow: F32, used: NDArray[np.int64], scale: F32
+    ) -> F32:
         to = picture(flow[0], held.images.shape[2])[None]
         moved = np.empty((len(used), *held.images.shape[1:]), np.float32)
         for j, i in enumerate(used):
@@ -98,7 +104,7 @@ class Reference:
     def mix_prototypes(self, held: Prototypes, flows: F32, weights: F32, scale: F32) -> F32:
         mixed = np.zeros((len(flows), 3, *scale.shape), np.float32)
         for b, (flow, share) in enumerate(zip(flows, weights, strict=True)):
-            used = np.flatnonzero(share).astype(np.int32)
+            used = np.flatnonzero(share)
             moved = self.move_prototypes(held, flow[None], used, scale)
             mixed[b] = np.tensordot(share[used].astype(np.float64), moved, axes=1)
         return mixed
