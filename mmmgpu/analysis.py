@@ -88,11 +88,11 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
     weight = basis.w_f.ravel()[pixels]
     y, x = np.unravel_index(pixels, basis.w_f.shape)
     moving = basis.flows[basis.moving].reshape(len(basis.moving), -1, 2)[:, pixels]
-    along = np.ascontiguousarray(moving.transpose(2, 1, 0).reshape(2 * len(pixels), -1))
+    along = moving.transpose(2, 1, 0).reshape(2 * len(pixels), len(moving))
     weighted = along * np.sqrt(np.tile(weight, 2))[:, None]
     gram = weighted.T @ weighted
     energy = float(np.trace(gram)) / len(gram)
-    if energy < STILL * float(weight.sum()):
+    if energy <= STILL * float(weight.sum()):
         raise InputError(
             "the mouth never moves in the prototypes; give clips of speech, or --region X,Y,W,H"
         )

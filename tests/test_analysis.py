@@ -279,3 +279,5 @@ def test_inputs_are_not_changed(basis, analyzer, kernels):
 def test_prototypes_that_do_not_move_are_an_error(basis, kernels):
     with pytest.raises(InputError, match="never moves"):
         prepare_analysis(replace(basis, flows=np.zeros_like(basis.flows)), kernels)
+    with pytest.raises(InputError, match="never moves"):
+        prepare_analysis(replace(basis, w_f=np.zeros_like(basis.w_f)), kernels)

@@ -4,6 +4,7 @@ import gc
 import os
 import subprocess
 import sys
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -225,6 +226,17 @@ def test_every_output_is_written_and_no_scratch_is_read_before(backend, monkeypa
     monkeypatch.setattr(type(k), "empty", poisoned)
     for actual, desired in zip(everything(), clean, strict=True):
         assert_array_equal(actual, desired)
+
+
+def test_what_is_fetched_keeps_what_it_shows_alive(backend):
+    """An operation may return its input, whose memory may be that of an array nobody holds."""
+    k, given = get_backend(backend), np.full((3, 20), 7, np.float32)
+    fetched, alive = k.to_host(k.to_device(given)), weakref.ref(given)
+    shared = np.shares_memory(fetched, given)
+    del given
+    gc.collect()
+    assert not shared or alive() is not None
+    assert_array_equal(fetched, np.full((3, 20), 7))
 
 
 def test_device_operations_may_be_called_from_many_threads(backend):

@@ -1,5 +1,6 @@
 """What every runtime makes of moved and mixed prototypes, against the reference."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -143,6 +144,41 @@ def test_any_number_of_threads_gives_the_same_bits(backend):
         one, *others = (run(backend, images, flows, *given, threads=n) for n in (1, 2, 5))
         for other in others:
             assert_array_equal(other, one)
+
+
+def test_scratch_is_used_again(backend, monkeypatch):
+    k, size = replace(get_backend(backend), workers=2), (9, 20)
+    images, flows = prototypes("tearing", size)
+    held = k.hold_prototypes(images, flows, HOLE)
+    to, how = map(k.to_device, (planes(flows[1:2]), planes(np.ones((*size, 1), np.float32))[0]))
+    first = k.to_host(k.move_prototypes(held, to, np.arange(NUMBER), how)).copy()
+    empty, asked = type(k).empty, []
+
+    def counted(self, *shape, dtype=np.float32):
+        asked.append(shape)
+        return empty(self, *shape, dtype=dtype)
+
+    monkeypatch.setattr(type(k), "empty", counted)
+    for number in (1, NUMBER):
+        again = k.to_host(k.move_prototypes(held, to, np.arange(number), how))
+        assert_array_equal(again, first[:number])
+    assert asked == [(1, 3, 9, 32), (1,), (NUMBER, 3, 9, 32), (NUMBER,)]  # what is returned
+
+
+def test_threads_that_share_prototypes_do_not_share_scratch(backend):
+    k, size = get_backend(backend), (33, 64)
+    images, flows = prototypes("tearing", size)
+    held = k.hold_prototypes(images, flows, HOLE)
+    how = k.to_device(np.ones(size, np.float32))
+
+    def move(step):
+        to = k.to_device(planes(flows[1:2] * np.float32(0.1 * step)))
+        return k.to_host(k.move_prototypes(held, to, np.arange(NUMBER), how)).copy()
+
+    alone = list(map(move, range(12)))
+    with ThreadPoolExecutor(4) as pool:
+        for together, desired in zip(pool.map(move, range(12)), alone, strict=True):
+            assert_array_equal(together, desired)
 
 
 def test_a_prototype_that_leaves_the_picture_is_an_error(backend):

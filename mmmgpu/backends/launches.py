@@ -6,9 +6,10 @@ A runtime (Warp, OpenCL) is a subclass that knows how to hold arrays and how to 
 import functools
 import itertools
 import math
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ class Prototypes:
     number, height, width: M and the size of a prototype.
     nodes: See `mmmgpu.backends.orientation.Orientations`.
     hole: Less weight makes a pixel a hole.
+    scratch: What each thread of the host needed last, to be used again: nothing is allocated anew
+        for every frame.
     """
 
     arrays: tuple[Any, ...]
@@ -55,6 +58,7 @@ class Prototypes:
     width: int
     nodes: int
     hole: float
+    scratch: threading.local = field(default_factory=threading.local, compare=False)
 
 
 @dataclass(frozen=True)
@@ -240,26 +244,37 @@ class Launches(ABC):
         workers = min(self.workers, len(members[0]) - 1)
         size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
         ring = 1 << (held.height - 1).bit_length()
+        scratch = self._scratch(held, workers, together, size, ring)
         arrived = self.empty(mixtures, dtype=np.int32)
         given = zip(members, (np.int32, np.int32, np.float32), strict=True)
         inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
         inputs += [frames, mixtures, together, held.height, held.width, size, ring, held.nodes]
         inputs += [held.hole, workers]
-        outputs = [
-            self.empty(workers, ring, pitch + MARGIN, COLOURS + 1),
-            self.empty(workers, COLOURS + 1, size),
-            self.empty(workers, together, 2, held.height * pitch + LANES),
-            self.empty(workers, together, 2, held.nodes),
-            self.empty(workers, held.height + 1, dtype=np.int32),
-            self.empty(workers, 2, pitch, dtype=np.int32),
-            self.empty(workers, 7, pitch),
-            self.empty(workers, held.height, pitch, dtype=np.int32),
-            mixed,
-            arrived,
-        ]
+        outputs = [*scratch, mixed, arrived]
         self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
         check_some_valid(self.to_host(arrived))
         return mixed
+
+    def _scratch(
+        self, held: Prototypes, workers: int, together: int, size: int, ring: int
+    ) -> list[Any]:
+        """Of as many workers at least, and of this thread alone."""
+        pitch, kept = pitch_of(held.width), held.scratch.__dict__
+        if kept.get("together") != together or kept["workers"] < workers:
+            kept.clear()  # before more is asked for
+            kept["arrays"] = [
+                self.empty(workers, ring, pitch + MARGIN, COLOURS + 1),
+                self.empty(workers, COLOURS + 1, size),
+                self.empty(workers, together, 2, held.height * pitch + LANES),
+                self.empty(workers, together, 2, held.nodes),
+                self.empty(workers, held.height + 1, dtype=np.int32),
+                self.empty(workers, 2, pitch, dtype=np.int32),
+                self.empty(workers, 7, pitch),
+                self.empty(workers, held.height, pitch, dtype=np.int32),
+            ]
+            kept |= {"together": together, "workers": workers}
+        arrays: list[Any] = kept["arrays"]
+        return arrays
 
     def piecewise_warp(
         self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any

@@ -151,7 +151,10 @@ def _faults_of(device: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Array:
-    """An array on a device, in C order; data: its buffer, None where nothing is in it.
+    """An array on a device, in C order.
+
+    data: Its buffer, None where nothing is in it.
+    host: What it was made of; a view of the buffer would not keep that alive.
 
     `pyopencl.array.Array` takes longer to make than a small launch.
     """
@@ -159,6 +162,7 @@ class Array:
     data: Any
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
+    host: NDArray[Any] | None = None
 
     @property
     def size(self) -> int:
@@ -175,14 +179,19 @@ class OpenCL(Launches):
     def to_device(self, array: NDArray[Any]) -> Any:
         if not array.size:  # there are no empty buffers
             return self.empty(*array.shape, dtype=array.dtype)
-        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
+        flags, host = (
+            cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR,
+            np.ascontiguousarray(array),
+        )
         with _faults_of(self.name):
-            data = cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(array))
-        return Array(data, array.shape, array.dtype)
+            data = cl.Buffer(self.queue.context, flags, hostbuf=host)
+        return Array(data, array.shape, array.dtype, host)
 
     def to_host(self, array: Any) -> F32:
         if not array.size:
             return np.empty(array.shape, array.dtype)
+        if array.host is not None:
+            return np.asarray(array.host)
         flags, shape = cl.map_flags.READ, array.shape
         with _faults_of(self.name):
             host, _ = cl.enqueue_map_buffer(self.queue, array.data, flags, 0, shape, array.dtype)
