@@ -83,6 +83,19 @@ def mixture(rng, number, height, width, channels):
     return Case(name, "blend", (images, weights), size, 2 * number * size)
 
 
+def equations(rng, number=46, height=142, width=208):
+    """The Gram matrix of a frame's analysis: each product once, and those with the frame."""
+    *images, wanted = rng.random((number + 1, height, width, 3), dtype=np.float32)
+    products = number * (number + 1) // 2 + number
+    return Case(
+        f"normal_equations {number}x{height}x{width}x3",
+        "normal_equations",
+        (np.stack(images), wanted),
+        answer=(number + 1) * number,
+        operations=2 * products * wanted.size,
+    )
+
+
 def sample(rng, height=480, width=640):
     """Backward warping of a picture along a smooth flow, as of one frame."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
@@ -156,4 +169,7 @@ def piecewise(rng, height=288, width=360, batch=16, across=8):
     )
 
 
-CASES = (splat, fill, blend, blend_large, sample, sample_at_random, scan, rbf, piecewise)
+CASES = (
+    *(splat, fill, blend, blend_large, equations),
+    *(sample, sample_at_random, scan, rbf, piecewise),
+)

@@ -3,7 +3,7 @@
 Growth is the exponent of the power law through the median times, a straight line in logarithms: 1
 is linear. All sizes of an axis take turns. The best time of a size is that of one lucky turn, which
 another size may not have had; medians of as many turns scatter less. Frames begin at 8, which one
-launch takes: fewer are re-oriented two together, and so are another kind of work.
+launch takes. Of fewer, two workers re-orient less than four each together: another kind of work.
 """
 
 import numpy as np
@@ -13,8 +13,6 @@ from mmmgpu.bench.drawn import drawn_basis, drawn_coordinates
 from mmmgpu.bench.kernels import on_backend
 from mmmgpu.bench.pictures import synthesis
 from mmmgpu.bench.timing import timed
-
-TURNS = 15
 
 
 def pictures_of(name, prototypes=16, side=128, frames=4):
@@ -37,18 +35,18 @@ AXES = {  # what grows: sizes, what is timed, what is counted
 }
 
 
-def measure_growth(backends):
+def measure_growth(backends, *, turns=15):
     """For every axis and backend: sizes, median times [ms] and the exponent."""
-    return {axis: {name: grown(axis, name) for name in backends} for axis in AXES}
+    return {axis: {name: grown(axis, name, turns) for name in backends} for axis in AXES}
 
 
-def grown(axis, name):
+def grown(axis, name, turns):
     """Sizes in turns, so that all of them see the same load."""
     sizes, make, count = AXES[axis]
     runs = [make(name, size) for size in sizes]
     for run in runs:
         run()
-    typical = np.median([[timed(run)[0] for run in runs] for _ in range(TURNS)], axis=0)
+    typical = np.median([[timed(run)[0] for run in runs] for _ in range(turns)], axis=0)
     counts = [count(size) for size in sizes]
     exponent = float(np.polyfit(np.log(counts), np.log(typical), 1)[0])
     ms = [float(f"{1e3 * t:.4g}") for t in typical]

@@ -9,6 +9,12 @@ def blend(images, weights):
     return lambda: (weights @ flat).reshape(-1, *images.shape[1:])
 
 
+def normal_equations(images, wanted):
+    """The product with the transpose, of which BLAS computes one half; then one with a column."""
+    rows, column = images.reshape(len(images), -1), wanted.ravel()
+    return lambda: np.vstack([rows @ rows.T, rows @ column])
+
+
 def evaluate_rbf(points, centres, weights, affine, sharpness):
     """All Gaussians at once, distances by a product."""
     ones = np.ones((len(points), 1), np.float32)

@@ -69,8 +69,9 @@ def run_benchmarks(plan):
         },
     }
     if "growth" in parts:
-        results["growth"] = measure_growth(plan.backends)
-        results["threads"] = measure_threads(plan.backends, turns=3 if plan.quick else 9)
+        few = {"turns": QUICK.turns} if plan.quick else {}
+        results["growth"] = measure_growth(plan.backends, **few)
+        results["threads"] = measure_threads(plan.backends, **few)
     if "startup" in parts:
         results["startup"] = measure_startup(plan.backends)
     if "pipeline" in parts and is_installed():

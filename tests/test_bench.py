@@ -33,6 +33,7 @@ SMALL = {
     "fill": {"batch": 2, "height": 15, "width": 18},
     "blend": {"number": 3, "height": 9, "width": 7},
     "blend_large": {"number": 3, "height": 9, "width": 7},
+    "equations": {"number": 5, "height": 9, "width": 7},
     "sample": {"height": 12, "width": 17},
     "sample_at_random": {"height": 12, "width": 17},
     "scan": {"queries": 3, "corpus": 5, "points": 40},
@@ -235,7 +236,7 @@ def test_the_exponent_of_growth_is_that_of_the_power_law(monkeypatch, power):
     axis = (2, 4, 8), lambda name, n: lambda: n, int
     monkeypatch.setitem(growth.AXES, "pages", axis)
     monkeypatch.setattr(growth, "timed", lambda run: (0.1 * run() ** power, 0))
-    assert growth.grown("pages", "warp")["exponent"] == pytest.approx(power)
+    assert growth.grown("pages", "warp", 2)["exponent"] == pytest.approx(power)
 
 
 def test_a_turn_that_is_lucky_for_one_size_is_not_growth(monkeypatch):
@@ -243,7 +244,17 @@ def test_a_turn_that_is_lucky_for_one_size_is_not_growth(monkeypatch):
     lucky = iter([2, 1, *[1] * 100])
     monkeypatch.setitem(growth.AXES, "pages", axis)
     monkeypatch.setattr(growth, "timed", lambda run: (run() / next(lucky), 0))
-    assert growth.grown("pages", "warp")["exponent"] == pytest.approx(1)
+    assert growth.grown("pages", "warp", 5)["exponent"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("quick", "turns"), [(True, 3), (False, 15)])
+def test_growth_takes_as_many_turns_as_all_else(monkeypatch, quick, turns):
+    taken = []
+    monkeypatch.setattr(growth, "AXES", {"pages": ((1, 2), lambda name, n: lambda: n, int)})
+    monkeypatch.setattr(growth, "timed", lambda run: (taken.append(run()) or run(), 0))
+    monkeypatch.setattr(runs, "measure_threads", lambda *_, **__: {})
+    runs.run_benchmarks(runs.Plan(backends=["warp"], parts=["growth"], quick=quick))
+    assert taken == turns * [1, 2]
 
 
 def test_a_copy_reads_and_writes_as_many_bytes_as_it_says(monkeypatch):
