@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mmmgpu.backends import Backend, get_backend
 from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import Basis, around, cut
+from mmmgpu.batches import in_parts
 
 F32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -102,7 +103,18 @@ def mouths(
 
 
 def synthesize_batch(synthesizer: Synthesizer, alpha: Floats, beta: Floats) -> F32:
-    """Mouth regions (B, h, w, 3) in [0, 1] of alpha (B, M - 1) and beta (B, M)."""
+    """Mouth regions (B, h, w, 3) in [0, 1] of alpha (B, M - 1) and beta (B, M).
+
+    They are made by one launch, or by as few as the device's memory allows.
+
+    Raises:
+        DeviceMemoryError: It does not hold a single frame.
+    """
+    parts = in_parts(lambda part: _made(synthesizer, alpha[part], beta[part]), len(alpha))
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _made(synthesizer: Synthesizer, alpha: Floats, beta: Floats) -> F32:
     s, k = synthesizer, synthesizer.kernels
     weights = np.where(beta > NO_TEXTURE, beta, 0)
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)

@@ -8,7 +8,9 @@ from numpy.testing import assert_array_equal
 from test_operations import CALLS, call, first
 
 from mmmgpu.backends import get_backend, nvwarp, opencl
+from mmmgpu.backends.planes import planes
 from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
+from mmmgpu.synthesis import prepare_synthesis, synthesize_batch
 
 
 def driver_error(name, kind=cl.RuntimeError):
@@ -55,7 +57,7 @@ def test_a_kernel_that_cannot_be_built_is_one_line_with_the_driver_s_reason(monk
 @pytest.mark.parametrize("code", sorted(opencl.NO_MEMORY | opencl.GONE))
 def test_a_failure_of_the_driver_names_the_device(monkeypatch, code):
     k = get_backend("opencl:0:0")
-    array = k.to_device(np.ones((1, 2, 2, 1), np.float32))
+    array = k.empty(1, 2, 2, 1)
     name = cl.status_code.to_string(code)
     monkeypatch.setattr(cl, "enqueue_map_buffer", raising(driver_error(name)))
     kind = DeviceMemoryError if code in opencl.NO_MEMORY else DeviceError
@@ -65,7 +67,7 @@ def test_a_failure_of_the_driver_names_the_device(monkeypatch, code):
 
 def test_a_defect_of_ours_is_not_blamed_on_the_driver(monkeypatch):
     k = get_backend("opencl")
-    array = k.to_device(np.ones((1, 2, 2, 1), np.float32))
+    array = k.empty(1, 2, 2, 1)
     monkeypatch.setattr(cl, "enqueue_map_buffer", raising(driver_error("INVALID_KERNEL_ARGS")))
     with pytest.raises(cl.RuntimeError, match="INVALID_KERNEL_ARGS"):
         k.to_host(array)
@@ -152,6 +154,35 @@ def test_what_does_not_fit_is_done_in_parts(monkeypatch, backend, name):
     parts = call(name, backend, **MANY[name])
     assert max(asked) > most  # it was tried
     assert_array_equal(first(parts), first(whole))
+
+
+def test_frames_that_do_not_fit_are_made_by_several_launches(monkeypatch, backend, basis):
+    """As many as fit, however much was kept for more of them."""
+    given = np.zeros((9, 4)), RNG.dirichlet(np.ones(5), 9)
+    asked = limit_memory(monkeypatch, backend, np.inf)
+    synthesizer = prepare_synthesis(basis, backend=backend)
+    asked.clear()
+    whole = synthesize_batch(synthesizer, *given)
+    most = max(asked) // 2
+    asked = limit_memory(monkeypatch, backend, most)
+    parts = synthesize_batch(synthesizer, *given)
+    assert max(asked) > most  # it was tried
+    assert_array_equal(parts, whole)
+    limit_memory(monkeypatch, backend, 4)
+    with pytest.raises(DeviceMemoryError, match="not enough memory"):
+        synthesize_batch(synthesizer, *given)
+
+
+def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, basis):
+    synthesizer = prepare_synthesis(basis, backend=backend)
+    k, held, scale = synthesizer.kernels, synthesizer.held, synthesizer.scale
+    flows, weights = k.to_device(planes(basis.flows)), np.eye(5, dtype=np.float32)
+    k.mix_prototypes(held, flows, weights, scale)
+    assert vars(held.scratch)
+    limit_memory(monkeypatch, backend, 1)
+    with pytest.raises(DeviceMemoryError, match="not enough memory"):
+        k.mix_prototypes(held, flows, weights, scale)
+    assert not vars(held.scratch)
 
 
 @pytest.mark.parametrize("name", CALLS)

@@ -8,7 +8,8 @@ import itertools
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends.orientation import orient
 from mmmgpu.backends.planes import LANES, pitch_of
+from mmmgpu.errors import DeviceMemoryError
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
@@ -214,7 +216,8 @@ class Launches(ABC):
         self, held: Prototypes, flow: Any, used: NDArray[np.int64], scale: Any
     ) -> Any:
         alone = [np.arange(len(used) + 1), used, np.ones((len(used), 1))]
-        return self._mixtures(held, flow, 1, len(used), alone, scale)
+        with _scratch_freed_on_failure(held):
+            return self._mixtures(held, flow, 1, len(used), alone, scale)
 
     def mix_prototypes(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
         mixtures, number = weights.shape
@@ -225,7 +228,8 @@ class Launches(ABC):
         used = padded.any(axis=1)
         parts = np.concatenate([[0], np.cumsum(np.count_nonzero(used, axis=1))])
         members = [parts, np.nonzero(used)[1], padded.transpose(0, 2, 1)[used]]
-        return self._mixtures(held, flows, mixtures, mixtures, members, scale)
+        with _scratch_freed_on_failure(held):
+            return self._mixtures(held, flows, mixtures, mixtures, members, scale)
 
     def _mixtures(
         self,
@@ -323,6 +327,16 @@ class Launches(ABC):
             rest = [fields, points, channels, whole]
             self.launch("distance_scan.pack", first, count, rest, [planes])
         return planes
+
+
+@contextmanager
+def _scratch_freed_on_failure(held: Prototypes) -> Iterator[None]:
+    """Where memory is short, fewer frames may be asked for next: they need less."""
+    try:
+        yield
+    except DeviceMemoryError:
+        held.scratch.__dict__.clear()
+        raise
 
 
 def _pyramid(height: int, width: int) -> int:
