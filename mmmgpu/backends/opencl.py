@@ -24,7 +24,8 @@ from mmmgpu.arrays import F32
 from mmmgpu.backends import default_threads
 from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
-from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
+from mmmgpu.backends.memory import keep_freed_memory
+from mmmgpu.backends.opencl_memory import Array, OwnMemory, SharedMemory
 from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
 from mmmgpu.errors import DeviceError, InputError
@@ -66,11 +67,10 @@ def open_backend(device: str, threads: int) -> "OpenCL":
     if not found.double_fp_config:
         raise InputError(f"device 'opencl:{chosen}' has no float64; choose another")
     queue = cl.CommandQueue(cl.Context([found]))
-    on_cpu = bool(found.type & cl.device_type.CPU)
-    if on_cpu:
-        keep_freed_memory()
-    workers = found.max_compute_units if on_cpu else GPU_WORKERS
-    return OpenCL(workers, f"opencl:{chosen}", queue)
+    if not found.type & cl.device_type.CPU:
+        return OpenCL(GPU_WORKERS, f"opencl:{chosen}", queue, OwnMemory(queue))
+    keep_freed_memory()
+    return OpenCL(found.max_compute_units, f"opencl:{chosen}", queue, SharedMemory(queue))
 
 
 def list_devices() -> dict[str, str]:
@@ -150,64 +150,30 @@ def _faults_of(device: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Array:
-    """An array on a device, in C order.
-
-    data: Its buffer, None where nothing is in it.
-    host: What it was made of; a view of the buffer would not keep that alive.
-
-    `pyopencl.array.Array` takes longer to make than a small launch.
-    """
-
-    data: Any
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    host: NDArray[Any] | None = None
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
-
-
-@dataclass(frozen=True)
 class OpenCL(Launches):
     """Device arrays are `Array`."""
 
     name: str  # for `get_backend`
     queue: Any
+    memory: SharedMemory | OwnMemory
 
     def to_device(self, array: NDArray[Any]) -> Any:
-        if not array.size:  # there are no empty buffers
+        if not array.size:
             return self.empty(*array.shape, dtype=array.dtype)
-        flags, host = (
-            cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR,
-            np.ascontiguousarray(array),
-        )
         with _faults_of(self.name):
-            data = cl.Buffer(self.queue.context, flags, hostbuf=host)
-        return Array(data, array.shape, array.dtype, host)
+            return self.memory.bring(np.ascontiguousarray(array))
 
     def to_host(self, array: Any) -> F32:
         if not array.size:
             return np.empty(array.shape, array.dtype)
-        if array.host is not None:
-            return np.asarray(array.host)
-        flags, shape = cl.map_flags.READ, array.shape
         with _faults_of(self.name):
-            host, _ = cl.enqueue_map_buffer(self.queue, array.data, flags, 0, shape, array.dtype)
-        return np.asarray(host)
+            return self.memory.fetch(array)
 
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
-        """Of more than `KEPT` bytes on a CPU it is mapped, which waits for what is queued."""
         kind = np.dtype(dtype)
         size = math.prod(shape) * kind.itemsize
         with _faults_of(self.name):
-            flags = cl.mem_flags.READ_WRITE
-            data = cl.Buffer(self.queue.context, flags, size) if size else None
-        made = Array(data, shape, kind)
-        if size > KEPT and self.queue.device.type & cl.device_type.CPU:
-            use_huge_pages(self.to_host(made).ctypes.data, size)
-        return made
+            return Array(self.memory.allocate(size) if size else None, shape, kind)
 
     def copy(self, target: Any, source: Any, first: int, count: int) -> None:
         row = source.size // source.shape[0] * source.dtype.itemsize
