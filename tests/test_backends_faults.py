@@ -1,5 +1,7 @@
 """Drivers and devices that fail: one clear line, or less at a time."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -8,6 +10,7 @@ from numpy.testing import assert_array_equal
 from test_operations import CALLS, call, first
 
 from mmmgpu.backends import get_backend, nvwarp, opencl
+from mmmgpu.backends.memory import HELD
 from mmmgpu.backends.planes import planes
 from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
 from mmmgpu.synthesis import prepare_synthesis, synthesize_batch
@@ -75,6 +78,17 @@ def test_a_defect_of_ours_is_not_blamed_on_the_driver(monkeypatch):
     with pytest.raises(RuntimeError, match="argument is missing") as raised:
         call("blend", "warp")
     assert not isinstance(raised.value, InputError)
+
+
+@pytest.mark.parametrize("pooled", [True, False])
+def test_a_cuda_device_keeps_memory_for_the_next_frame(monkeypatch, pooled):
+    """Its pool, where it has one, gives back what is free whenever the host waits for it."""
+    device = SimpleNamespace(is_cpu=False, alias="cuda:0", is_mempool_enabled=pooled)
+    held = []
+    monkeypatch.setattr(wp, "get_device", lambda _: device)
+    monkeypatch.setattr(wp, "set_mempool_release_threshold", lambda *given: held.append(given))
+    assert nvwarp.open_backend("cuda:0", 2).device == "cuda:0"
+    assert held == [(device, HELD)] * pooled
 
 
 @pytest.mark.parametrize("function", ["launch", "synchronize_device"])

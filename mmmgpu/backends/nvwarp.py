@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32
 from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
-from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
+from mmmgpu.backends.memory import HELD, KEPT, keep_freed_memory, use_huge_pages
 from mmmgpu.errors import InputError
 
 NO_MEMORY = "Failed to allocate"  # what Warp says
@@ -42,6 +42,8 @@ def open_backend(device: str, threads: int) -> "Warp":
     if found.is_cpu:
         keep_freed_memory()
         return Warp(workers=threads, device="cpu", threads=threads)
+    if found.is_mempool_enabled:  # else each fetch would give back all that is free
+        wp.set_mempool_release_threshold(found, HELD)
     return Warp(workers=GPU_WORKERS, device=found.alias, threads=1)
 
 
