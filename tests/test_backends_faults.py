@@ -192,11 +192,11 @@ def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, basis):
     k, held, scale = synthesizer.kernels, synthesizer.held, synthesizer.scale
     flows, weights = k.to_device(planes(basis.flows)), np.eye(5, dtype=np.float32)
     k.mix_prototypes(held, flows, weights, scale)
-    assert vars(held.scratch)
+    assert vars(k.scratch)
     limit_memory(monkeypatch, backend, 1)
     with pytest.raises(DeviceMemoryError, match="not enough memory"):
         k.mix_prototypes(held, flows, weights, scale)
-    assert not vars(held.scratch)
+    assert not vars(k.scratch)
 
 
 @pytest.mark.parametrize("name", CALLS)

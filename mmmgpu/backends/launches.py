@@ -50,8 +50,6 @@ class Prototypes:
     number, height, width: M and the size of a prototype.
     nodes: See `mmmgpu.backends.orientation.Orientations`.
     hole: Less weight makes a pixel a hole.
-    scratch: What each thread of the host needed last, to be used again: nothing is allocated anew
-        for every frame.
     """
 
     arrays: tuple[Any, ...]
@@ -60,7 +58,6 @@ class Prototypes:
     width: int
     nodes: int
     hole: float
-    scratch: threading.local = field(default_factory=threading.local, compare=False)
 
 
 @dataclass(frozen=True)
@@ -68,6 +65,8 @@ class Launches(ABC):
     """The operations of `mmmgpu.backends.Backend`, over five things that a runtime can do."""
 
     workers: int  # accumulators of a forward warp
+    # what each thread of the host needed last, so that not every frame allocates it anew
+    scratch: threading.local = field(init=False, default_factory=threading.local, compare=False)
 
     @abstractmethod
     def to_device(self, array: NDArray[Any]) -> Any: ...
@@ -216,8 +215,7 @@ class Launches(ABC):
         self, held: Prototypes, flow: Any, used: NDArray[np.int64], scale: Any
     ) -> Any:
         alone = [np.arange(len(used) + 1), used, np.ones((len(used), 1))]
-        with _scratch_freed_on_failure(held):
-            return self._mixtures(held, flow, 1, len(used), alone, scale)
+        return self._mixtures(held, flow, 1, len(used), alone, scale)
 
     def mix_prototypes(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
         mixtures, number = weights.shape
@@ -228,8 +226,7 @@ class Launches(ABC):
         used = padded.any(axis=1)
         parts = np.concatenate([[0], np.cumsum(np.count_nonzero(used, axis=1))])
         members = [parts, np.nonzero(used)[1], padded.transpose(0, 2, 1)[used]]
-        with _scratch_freed_on_failure(held):
-            return self._mixtures(held, flows, mixtures, mixtures, members, scale)
+        return self._mixtures(held, flows, mixtures, mixtures, members, scale)
 
     def _mixtures(
         self,
@@ -241,44 +238,52 @@ class Launches(ABC):
         scale: Any,
     ) -> Any:
         """Run kernels/prototypes with an accumulator for every worker."""
-        pitch, together = pitch_of(held.width), members[2].shape[1]
-        mixed = self.empty(mixtures, 3, held.height, pitch)
+        height, pitch, together = held.height, pitch_of(held.width), members[2].shape[1]
         if not mixtures:
-            return mixed
+            return self.empty(0, 3, height, pitch)
         workers = min(self.workers, len(members[0]) - 1)
-        size = _pyramid((held.height + 1) // 2, (held.width + 1) // 2)
-        ring = 1 << (held.height - 1).bit_length()
-        scratch = self._scratch(held, workers, together, size, ring)
-        arrived = self.empty(mixtures, dtype=np.int32)
+        size = _pyramid((height + 1) // 2, (held.width + 1) // 2)
+        ring = 1 << (height - 1).bit_length()
         given = zip(members, (np.int32, np.int32, np.float32), strict=True)
-        inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
-        inputs += [frames, mixtures, together, held.height, held.width, size, ring, held.nodes]
-        inputs += [held.hole, workers]
-        outputs = [*scratch, mixed, arrived]
-        self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
-        check_some_valid(self.to_host(arrived))
+        shapes = [
+            ((ring, pitch + MARGIN, COLOURS + 1), np.float32),
+            ((COLOURS + 1, size), np.float32),
+            ((together, 2, height * pitch + LANES), np.float32),
+            ((together, 2, height * pitch + size), np.float32),  # at least as many as nodes
+            ((height + 1,), np.int32),
+            ((2, pitch), np.int32),
+            ((7, pitch), np.float32),
+            ((height, pitch), np.int32),
+        ]
+        with self._scratch(workers, shapes) as scratch:
+            mixed, arrived = (
+                self.empty(mixtures, 3, height, pitch),
+                self.empty(mixtures, dtype=np.int32),
+            )
+            inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
+            inputs += [frames, mixtures, together, height, held.width, size, ring, held.nodes]
+            inputs += [held.hole, workers]
+            outputs = [*scratch, mixed, arrived]
+            self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
+            check_some_valid(self.to_host(arrived))
         return mixed
 
-    def _scratch(
-        self, held: Prototypes, workers: int, together: int, size: int, ring: int
-    ) -> list[Any]:
-        """Of as many workers at least, and of this thread alone."""
-        pitch, kept = pitch_of(held.width), held.scratch.__dict__
-        if kept.get("together") != together or kept["workers"] < workers:
-            kept.clear()  # before more is asked for
-            kept["arrays"] = [
-                self.empty(workers, ring, pitch + MARGIN, COLOURS + 1),
-                self.empty(workers, COLOURS + 1, size),
-                self.empty(workers, together, 2, held.height * pitch + LANES),
-                self.empty(workers, together, 2, held.nodes),
-                self.empty(workers, held.height + 1, dtype=np.int32),
-                self.empty(workers, 2, pitch, dtype=np.int32),
-                self.empty(workers, 7, pitch),
-                self.empty(workers, held.height, pitch, dtype=np.int32),
-            ]
-            kept |= {"together": together, "workers": workers}
-        arrays: list[Any] = kept["arrays"]
-        return arrays
+    @contextmanager
+    def _scratch(self, workers: int, shapes: list[Any]) -> Iterator[list[Any]]:
+        """Arrays (workers or more, *shape), of this thread alone.
+
+        Where memory is short they are given up: fewer frames, which may be next, need less.
+        """
+        kept = self.scratch.__dict__
+        try:
+            if kept.get("shapes") != shapes or kept["workers"] < workers:
+                kept.clear()
+                arrays = [self.empty(workers, *shape, dtype=dtype) for shape, dtype in shapes]
+                kept |= {"shapes": shapes, "workers": workers, "arrays": arrays}
+            yield kept["arrays"]
+        except DeviceMemoryError:
+            kept.clear()
+            raise
 
     def piecewise_warp(
         self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any
@@ -327,16 +332,6 @@ class Launches(ABC):
             rest = [fields, points, channels, whole]
             self.launch("distance_scan.pack", first, count, rest, [planes])
         return planes
-
-
-@contextmanager
-def _scratch_freed_on_failure(held: Prototypes) -> Iterator[None]:
-    """Where memory is short, fewer frames may be asked for next: they need less."""
-    try:
-        yield
-    except DeviceMemoryError:
-        held.scratch.__dict__.clear()
-        raise
 
 
 def _pyramid(height: int, width: int) -> int:
