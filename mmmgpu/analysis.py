@@ -47,6 +47,14 @@ THUMBNAIL = 24  # [px] width of the pictures in which the nearest prototypes are
 
 
 @dataclass(frozen=True)
+class Scale:
+    """What pictures are multiplied by, (h, pitch), and the same on the device."""
+
+    plane: F32
+    held: Any
+
+
+@dataclass(frozen=True)
 class Analyzer:
     """What analysis needs of a basis, computed once.
 
@@ -56,8 +64,8 @@ class Analyzer:
         w_f there; places (n, 2): where they are, (x, y) [px].
     along: the prototype flows there, x above y, (2 n, M - 1).
     gram: Cholesky factor of the regularised Gram matrix of the flows.
-    everywhere: sqrt(w_t), but not below 0.01: what a step needs to see, (h, pitch).
-    masked: sqrt(w_t) where that is above 0.1, else 0, (h, pitch).
+    everywhere: sqrt(w_t), but not below 0.01: what a step needs to see.
+    masked: sqrt(w_t) where that is above 0.1, else 0.
     thumbnails: small masked prototypes, (M, k).
     """
 
@@ -71,8 +79,8 @@ class Analyzer:
     places: F32
     along: F32
     gram: tuple[Floats, bool]
-    everywhere: F32
-    masked: F32
+    everywhere: Scale
+    masked: Scale
     thumbnails: F32
 
 
@@ -109,10 +117,15 @@ def prepare_analysis(basis: Basis, kernels: Backend, *, flow: str = "dis") -> An
         places=np.stack([x, y], axis=1).astype(np.float32),
         along=along,
         gram=cho_factor(regular),
-        everywhere=planes(np.maximum(root, UNSEEN)[..., None])[0],
-        masked=planes(np.where(basis.w_t > MOUTH, root, 0)[..., None])[0],
+        everywhere=_scale(np.maximum(root, UNSEEN), kernels),
+        masked=_scale(np.where(basis.w_t > MOUTH, root, 0), kernels),
         thumbnails=np.stack([thumbnail(image, basis.w_t) for image in basis.images]),
     )
+
+
+def _scale(root: F32, kernels: Backend) -> Scale:
+    plane = planes(root[..., None])[0]
+    return Scale(plane, kernels.to_device(plane))
 
 
 def chessboard(shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -215,22 +228,21 @@ def _fit_texture(
     beta = _fit_beta(analyzer, wanted, moved, used, scale)
     shares = k.to_device(beta[None, used].astype(np.float32))
     mixed, width = k.to_host(k.blend(moved, shares))[0], flow.shape[1]
-    return beta, picture(mixed[..., :width] / scale[:, :width], width)
+    return beta, picture(mixed[..., :width] / scale.plane[:, :width], width)
 
 
-def _moved(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: F32) -> Any:
+def _moved(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: Scale) -> Any:
     """On the device: the prototypes `used` (n,) along `flow`, scaled, (n, 3, h, pitch)."""
     k = analyzer.kernels
-    to, how = map(k.to_device, (planes(flow[None]), scale))
-    return k.move_prototypes(analyzer.held, to, used, how)
+    return k.move_prototypes(analyzer.held, k.to_device(planes(flow[None])), used, scale.held)
 
 
 def _fit_beta(
-    analyzer: Analyzer, wanted: F32, moved: Any, used: NDArray[np.int64], scale: F32
+    analyzer: Analyzer, wanted: F32, moved: Any, used: NDArray[np.int64], scale: Scale
 ) -> Floats:
     """beta (M,), zero outside `used`; moved: what `_moved` gives for `scale`."""
     k = analyzer.kernels
-    products = k.to_host(k.normal_equations(moved, k.to_device(wanted * scale)))
+    products = k.to_host(k.normal_equations(moved, k.to_device(wanted * scale.plane)))
     beta = np.zeros(len(analyzer.thumbnails))
     beta[used] = solve_simplex(products[:-1], products[-1])
     return beta

@@ -224,7 +224,7 @@ def test_no_moved_prototypes_are_brought_to_the_host(basis, backend, monkeypatch
     monkeypatch.setattr(type(kernels), "to_host", watched)
     analyze(analyzer, basis.images[1])
     pictures = [shape for shape in fetched if len(shape) > 2]
-    assert pictures == [(1, 3, *analyzer.masked.shape)] * STEPS
+    assert pictures == [(1, 3, *analyzer.masked.plane.shape)] * STEPS
     assert (6, 5) in fetched  # the equations of all five
 
 

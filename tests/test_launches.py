@@ -166,7 +166,8 @@ def test_scratch_is_used_again(backend, monkeypatch):
 
 
 def test_threads_that_share_prototypes_do_not_share_scratch(backend):
-    k, size = get_backend(backend), (33, 64)
+    """Warp's threads run side by side, OpenCL has one queue: only Warp could show the fault."""
+    k, size = get_backend(backend), (160, 192)
     images, flows = prototypes("tearing", size)
     held = k.hold_prototypes(images, flows, HOLE)
     how = k.to_device(np.ones(size, np.float32))
@@ -177,8 +178,8 @@ def test_threads_that_share_prototypes_do_not_share_scratch(backend):
 
     alone = list(map(move, range(12)))
     with ThreadPoolExecutor(4) as pool:
-        for together, desired in zip(pool.map(move, range(12)), alone, strict=True):
-            assert_array_equal(together, desired)
+        for step, together in enumerate(pool.map(move, 3 * list(range(12)))):
+            assert_array_equal(together, alone[step % 12])
 
 
 def test_a_prototype_that_leaves_the_picture_is_an_error(backend):

@@ -8,8 +8,7 @@ import itertools
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -94,6 +93,16 @@ class Launches(ABC):
     @abstractmethod
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         """Call `work(first, n)` for contiguous parts of `count` items, on all threads."""
+
+    def within_memory(self, allocate: Callable[[], Any]) -> Any:
+        """What `allocate()` gives; where memory is short, this thread's scratch is given up for it."""
+        try:
+            return allocate()
+        except DeviceMemoryError:
+            if not self.scratch.__dict__:
+                raise
+            self.scratch.__dict__.clear()
+        return allocate()
 
     def launch(
         self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
@@ -255,35 +264,27 @@ class Launches(ABC):
             ((7, pitch), np.float32),
             ((height, pitch), np.int32),
         ]
-        with self._scratch(workers, shapes) as scratch:
-            mixed, arrived = (
-                self.empty(mixtures, 3, height, pitch),
-                self.empty(mixtures, dtype=np.int32),
-            )
-            inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
-            inputs += [frames, mixtures, together, height, held.width, size, ring, held.nodes]
-            inputs += [held.hole, workers]
-            outputs = [*scratch, mixed, arrived]
-            self.launch_all("prototypes.mix_prototypes", workers, inputs, outputs)
-            check_some_valid(self.to_host(arrived))
+        scratch = self._scratch(workers, shapes)
+        mixed, arrived = (
+            self.empty(mixtures, 3, height, pitch),
+            self.empty(mixtures, dtype=np.int32),
+        )
+        inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
+        inputs += [frames, mixtures, together, height, held.width, size, ring, held.nodes]
+        inputs += [held.hole, workers]
+        self.launch_all("prototypes.mix_prototypes", workers, inputs, [*scratch, mixed, arrived])
+        check_some_valid(self.to_host(arrived))
         return mixed
 
-    @contextmanager
-    def _scratch(self, workers: int, shapes: list[Any]) -> Iterator[list[Any]]:
-        """Arrays (workers or more, *shape), of this thread alone.
-
-        Where memory is short they are given up: fewer frames, which may be next, need less.
-        """
+    def _scratch(self, workers: int, shapes: list[Any]) -> list[Any]:
+        """Arrays (workers or more, *shape), of this thread alone."""
         kept = self.scratch.__dict__
-        try:
-            if kept.get("shapes") != shapes or kept["workers"] < workers:
-                kept.clear()
-                arrays = [self.empty(workers, *shape, dtype=dtype) for shape, dtype in shapes]
-                kept |= {"shapes": shapes, "workers": workers, "arrays": arrays}
-            yield kept["arrays"]
-        except DeviceMemoryError:
-            kept.clear()
-            raise
+        if kept.get("shapes") != shapes or kept["workers"] < workers:
+            kept.clear()  # before more is asked for
+            arrays = [self.empty(workers, *shape, dtype=dtype) for shape, dtype in shapes]
+            kept |= {"shapes": shapes, "workers": workers, "arrays": arrays}
+        arrays = kept["arrays"]
+        return arrays
 
     def piecewise_warp(
         self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any

@@ -8,19 +8,18 @@ from typing import Any
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 KEPT = 32 << 20  # bytes: larger blocks are never kept
-HELD = 256 << 20  # bytes that are free and kept
 
 
 def keep_freed_memory() -> None:
     """Let the C library reuse large blocks.
 
     Otherwise the arrays of every frame are fresh pages, a quarter of a frame's time. Blocks above
-    `KEPT` still go back at once, and so does what is free beyond `HELD`.
+    `KEPT` still go back at once, and so does what is free beyond 256 MiB.
     """
     mallopt = _of_c_library("mallopt")
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, KEPT)
-        mallopt(M_TRIM_THRESHOLD, HELD)
+        mallopt(M_TRIM_THRESHOLD, 256 << 20)
 
 
 def use_huge_pages(address: int, size: int) -> None:

@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32
 from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
-from mmmgpu.backends.memory import HELD, KEPT, keep_freed_memory, use_huge_pages
+from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
 from mmmgpu.errors import InputError
 
 NO_MEMORY = "Failed to allocate"  # what Warp says
 GONE = "CUDA error", "Failed to synchronize"
+POOLED = 0.5  # of a CUDA device's memory: so much, in use or free, is not given back
 
 
 def open_backend(device: str, threads: int) -> "Warp":
@@ -43,7 +44,7 @@ def open_backend(device: str, threads: int) -> "Warp":
         keep_freed_memory()
         return Warp(workers=threads, device="cpu", threads=threads)
     if found.is_mempool_enabled:  # else each fetch would give back all that is free
-        wp.set_mempool_release_threshold(found, HELD)
+        wp.set_mempool_release_threshold(found, POOLED)
     return Warp(workers=GPU_WORKERS, device=found.alias, threads=1)
 
 
@@ -94,8 +95,8 @@ class Warp(Launches):
 
     def to_device(self, array: NDArray[Any]) -> Any:
         # a strided array would come with its strides, which the launches do not look at
-        with _faults_of(self.device):
-            return wp.array(np.ascontiguousarray(array), device=self.device, copy=False)
+        host = np.ascontiguousarray(array)
+        return self._allocated(lambda: wp.array(host, device=self.device, copy=False))
 
     def to_host(self, array: Any) -> F32:
         with _faults_of(self.device):
@@ -105,11 +106,17 @@ class Warp(Launches):
 
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
         scalar = cast(Any, wp).dtype_from_numpy(dtype)
-        with _faults_of(self.device):
-            made = wp.empty(shape, dtype=scalar, device=self.device)
+        made = self._allocated(lambda: wp.empty(shape, dtype=scalar, device=self.device))
         if made.capacity > KEPT and self.device == "cpu":
             use_huge_pages(made.ptr, made.capacity)
         return made
+
+    def _allocated(self, allocate: Callable[[], Any]) -> Any:
+        def attempt() -> Any:
+            with _faults_of(self.device):
+                return allocate()
+
+        return self.within_memory(attempt)
 
     def copy(self, target: Any, source: Any, first: int, count: int) -> None:
         size = source.size // source.shape[0]

@@ -160,8 +160,7 @@ class OpenCL(Launches):
     def to_device(self, array: NDArray[Any]) -> Any:
         if not array.size:
             return self.empty(*array.shape, dtype=array.dtype)
-        with _faults_of(self.name):
-            return self.memory.bring(np.ascontiguousarray(array))
+        return self._allocated(self.memory.bring, np.ascontiguousarray(array))
 
     def to_host(self, array: Any) -> F32:
         if not array.size:
@@ -172,8 +171,15 @@ class OpenCL(Launches):
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
         kind = np.dtype(dtype)
         size = math.prod(shape) * kind.itemsize
-        with _faults_of(self.name):
-            return Array(self.memory.allocate(size) if size else None, shape, kind)
+        data = self._allocated(self.memory.allocate, size) if size else None
+        return Array(data, shape, kind)
+
+    def _allocated(self, allocate: Callable[[Any], Any], given: Any) -> Any:
+        def attempt() -> Any:
+            with _faults_of(self.name):
+                return allocate(given)
+
+        return self.within_memory(attempt)
 
     def copy(self, target: Any, source: Any, first: int, count: int) -> None:
         row = source.size // source.shape[0] * source.dtype.itemsize
