@@ -5,9 +5,11 @@ from pathlib import Path
 
 from mmmgpu.errors import InputError
 
+ACROSS = 5  # charts of a row
+
 
 def draw_growth(growth, threads, path):
-    """Side by side, in logarithms: one chart for each axis of growth, and one of threads.
+    """In logarithms: one chart for each axis of growth, and one of threads.
 
     Args:
         growth, threads: As of `bench.growth.measure_growth` and `bench.threads.measure_threads`.
@@ -19,9 +21,13 @@ def draw_growth(growth, threads, path):
     if Path(path).suffix != ".svg":
         raise InputError(f"{path}: must be named .svg")
     with mpl.rc_context({"svg.hashsalt": "mmmgpu", "svg.fonttype": "none", "font.size": 8}):
-        figure = Figure(figsize=(3 * len(growth) + 3, 2.8), layout="constrained")
-        *charts, last = figure.subplots(1, len(growth) + 1)
-        for axes, (axis, backends) in zip(charts, growth.items(), strict=True):
+        rows = math.ceil((len(growth) + 1) / ACROSS)
+        figure = Figure(figsize=(3 * ACROSS + 3, 2.8 * rows), layout="constrained")
+        charts = figure.subplots(rows, ACROSS).ravel()
+        last = charts[len(growth)]
+        for axes in charts[len(growth) + 1 :]:
+            axes.remove()
+        for axes, (axis, backends) in zip(charts, growth.items(), strict=False):
             for name, found in backends.items():
                 label = f"{name}: {found['exponent']:.2f}"
                 axes.loglog(found["counts"], found["median_ms"], "o-", ms=3, label=label)

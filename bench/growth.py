@@ -8,10 +8,10 @@ launch takes. Of fewer, two workers re-orient less than four each together: anot
 
 import numpy as np
 
-from mmmgpu.bench.cases import scan
+from mmmgpu.bench import cases
 from mmmgpu.bench.drawn import drawn_basis, drawn_coordinates
 from mmmgpu.bench.kernels import on_backend
-from mmmgpu.bench.pictures import synthesis
+from mmmgpu.bench.pictures import analysis_work, synthesis
 from mmmgpu.bench.timing import timed
 
 
@@ -21,21 +21,74 @@ def pictures_of(name, prototypes=16, side=128, frames=4):
     return synthesis(drawn_basis(prototypes, side), coordinates, name).load()
 
 
-def scan_of(name, rows):
-    """A distance scan of so many rows of the corpus, to be timed."""
-    case = scan(np.random.default_rng(0), queries=16, corpus=rows, points=4096)
-    return on_backend(case, name).load()
+def analyses_of(name, prototypes=16, side=128, frames=4):
+    """Analysis of so many frames, to be timed."""
+    work = analysis_work([name], prototypes=prototypes, side=side, frames=frames)
+    return work.contenders[name].load()
 
 
-AXES = {  # what grows: sizes, what is timed, what is counted
-    "pixels": ((64, 128, 256), lambda name, n: pictures_of(name, side=n), lambda n: n * n),
-    "prototypes": ((8, 16, 32), lambda name, n: pictures_of(name, prototypes=n), int),
-    "frames": ((8, 16, 32, 64), lambda name, n: pictures_of(name, frames=n, side=96), int),
-    "corpus rows": ((128, 512, 2048), scan_of, int),
+def operation(make, size, **fixed):
+    """Makes an operation to be timed: its case in a size that may be several of its arguments."""
+
+    def of(name, n):
+        return on_backend(make(np.random.default_rng(0), **size(n), **fixed), name).load()
+
+    return of
+
+
+def side(n):
+    """Of square pictures."""
+    return {"height": n, "width": n}
+
+
+def rows(n):
+    """Of the corpus."""
+    return {"corpus": n}
+
+
+def pictures(n):
+    """Of a batch."""
+    return {"batch": n}
+
+
+def square(n):
+    """Pixels of a picture of that side."""
+    return n * n
+
+
+SIDES, NUMBERS = (64, 128, 256), (8, 16, 32)
+AXES = {  # what grows, of which work: sizes, what is timed, what is counted
+    "pixels, synthesis": (SIDES, lambda name, n: pictures_of(name, side=n), square),
+    "prototypes, synthesis": (NUMBERS, lambda name, n: pictures_of(name, prototypes=n), int),
+    "frames, synthesis": (
+        (8, 16, 32, 64),
+        lambda name, n: pictures_of(name, frames=n, side=96),
+        int,
+    ),
+    "pixels, analysis": (SIDES, lambda name, n: analyses_of(name, side=n), square),
+    "prototypes, analysis": (NUMBERS, lambda name, n: analyses_of(name, prototypes=n), int),
+    "pixels, forward_warp": (SIDES, operation(cases.splat, side, batch=16), square),
+    "pixels, fill_holes": (SIDES, operation(cases.fill, side, batch=16), square),
+    "pixels, blend": (SIDES, operation(cases.blend, side), square),
+    "pixels, normal_equations": (SIDES, operation(cases.equations, side), square),
+    "images, normal_equations": (
+        NUMBERS,
+        operation(cases.equations, lambda n: {"number": n}),
+        int,
+    ),
+    "pixels, sample": ((256, 512, 1024), operation(cases.sample, side), square),
+    "corpus rows, distance_scan": (
+        (128, 512, 2048),
+        operation(cases.scan, rows, queries=16, points=4096),
+        int,
+    ),
+    "pixels, evaluate_rbf": (SIDES, operation(cases.rbf, side), square),
+    "pictures, piecewise_warp": ((4, 16, 64), operation(cases.piecewise, pictures), int),
 }
+LINEAR = ("pixels", "frames", "pictures", "corpus rows")  # with what the time is to grow so
 
 
-def measure_growth(backends, *, turns=15):
+def measure_growth(backends, turns):
     """For every axis and backend: sizes, median times [ms] and the exponent."""
     return {axis: {name: grown(axis, name, turns) for name in backends} for axis in AXES}
 

@@ -21,6 +21,7 @@ from mmmgpu.trajectories import (
 
 DIMENSIONS, PHONES, CLASSES, ORDER, LAMBDA = 50, 40, 6, 4, 1.0
 SIMPLE = 1e-8  # of the scale of what is solved for
+FACTOR, SOLVE = (ORDER + 1) ** 2, 4 * ORDER + 1  # operations of a frame, of a banded system
 
 
 def model_works(backends, peers):
@@ -101,7 +102,15 @@ def trajectory_work(peers, seconds=3, fps=25):
     peer = {"scipy solveh_banded": Contender(lambda: banded)} if "scipy" in peers else {}
     contenders = {"ours": Contender(lambda: ours, tolerance=SIMPLE), **peer}
     name = f"trajectory of {seconds} s, {DIMENSIONS} dimensions"
-    return Work(name, dense, contenders, items=n, unit="frame")
+    return Work(
+        name,
+        dense,
+        contenders,
+        bytes=DIMENSIONS * n * 3 * 8,
+        operations=DIMENSIONS * n * (FACTOR + SOLVE),
+        items=n,
+        unit="frame",
+    )
 
 
 def gdlr_work(seconds=15, fps=25):
@@ -130,7 +139,13 @@ def gdlr_work(seconds=15, fps=25):
         return slope
 
     name = f"GDLR gradient, {CLASSES} classes, {DIMENSIONS} dimensions, {seconds} s"
-    return Work(name, one_by_one, {"adjoint": Contender(lambda: adjoint, tolerance=SIMPLE)})
+    return Work(
+        name,
+        one_by_one,
+        {"adjoint": Contender(lambda: adjoint, tolerance=SIMPLE)},
+        bytes=DIMENSIONS * len(rows) * (ORDER + 2) * 8,
+        operations=DIMENSIONS * (len(rows) * 2 * SOLVE + 2 * PHONES * 2 * (DIMENSIONS + 1)),
+    )
 
 
 def training_work(seconds=120, fps=25, dimensions=DIMENSIONS, checked=5):
@@ -171,6 +186,8 @@ def training_work(seconds=120, fps=25, dimensions=DIMENSIONS, checked=5):
                 lambda: partial(one_by_one, factor_kept, dimensions), tolerance=SIMPLE
             ),
         },
+        bytes=dimensions * len(rows) * 8,
+        operations=dimensions * len(rows) * (FACTOR + 2 * SOLVE),
         part=checked / dimensions,
     )
 

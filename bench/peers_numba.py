@@ -118,21 +118,22 @@ def _mix(flat, weights):
 def normal_equations(images, wanted):
     """Pairs of images dealt out, each a sum of its own."""
     rows = np.concatenate([images, wanted[None]]).reshape(len(images) + 1, -1)
-    return lambda: _multiply(rows)
+    pairs = np.argwhere(np.tri(len(rows), len(images), dtype=bool))
+    return lambda: _multiply(rows, pairs)
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
-def _multiply(rows):
+def _multiply(rows, pairs):
     number, size = len(rows) - 1, rows.shape[1]
     out = np.empty((number + 1, number), np.float32)
-    for m in numba.prange(number + 1):
-        for n in range(min(m + 1, number)):
-            total = np.float32(0)
-            for p in range(size):
-                total += rows[m, p] * rows[n, p]
-            out[m, n] = total
-            if m < number:
-                out[n, m] = total
+    for k in numba.prange(len(pairs)):
+        m, n = pairs[k]
+        total = np.float32(0)
+        for p in range(size):
+            total += rows[m, p] * rows[n, p]
+        out[m, n] = total
+        if m < number:
+            out[n, m] = total
     return out
 
 

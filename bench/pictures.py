@@ -16,6 +16,7 @@ from mmmgpu.synthesis import mouths, prepare_synthesis
 PROTOTYPES, SIDE, FRAMES = 46, 256, 8
 EQUAL = 1e-4  # of pictures in [0, 1]
 ALIKE = 0.03  # of the scale of model coordinates: flows are found anew in slightly other pictures
+CARRIED = 2 * 6 * 2 + 8 * 4 + 2 * 3 + 8  # operations of a pixel of a prototype
 NO_FLOW = 1e-4  # [px] at which an inverse flow is done
 STEPS = 20
 
@@ -59,7 +60,7 @@ def frames_of(name, basis, coordinates, shown, contenders):
         synthesis(basis, first, "numpy", shown).load(),
         contenders,
         bytes=frames * (pixels * 5 * 4 + int(shown.sum()) * 3 * 4),
-        operations=frames * pixels * (2 * 6 * 2 + 8 * 4 + 2 * 3 + 8),
+        operations=frames * pixels * CARRIED,
         items=frames,
         unit="frame",
         part=1 / frames,
@@ -116,11 +117,13 @@ def analysis_work(backends, prototypes=PROTOTYPES, side=SIDE, frames=FRAMES):
     mouths = drawn_mouths(prototypes + frames, side)
     known = {image.tobytes() for image in basis.images}
     images = [image for image in mouths if image.tobytes() not in known][:frames]
+    pixels, products = int((basis.w_t > MOUTH).sum()), prototypes * (prototypes + 3) // 2
     return Work(
         f"analysis, {prototypes} prototypes of {side}x{side}",
         analysis(basis, images[:1], "numpy").load(),
         {name: analysis(basis, images, name) for name in backends},
-        bytes=frames * int((basis.w_t > MOUTH).sum()) * prototypes * 5 * 4,
+        bytes=frames * pixels * prototypes * 5 * 4,
+        operations=frames * pixels * (prototypes * CARRIED + products * 3 * 2),
         items=frames,
         unit="frame",
         part=1 / frames,

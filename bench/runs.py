@@ -20,9 +20,9 @@ from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 from mmmgpu.voices import is_installed
 
-# of the record; 3: single turns were not kept, references did not take turns, growth by the best;
+# of the record; 4: growth and threads of fewer works; 3: single turns were not kept, references did not take turns, growth by the best;
 # 2: no pause for OpenBLAS's threads; 1: short runs were not repeated
-VERSION = 4
+VERSION = 5
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
 
 
@@ -69,9 +69,8 @@ def run_benchmarks(plan):
         },
     }
     if "growth" in parts:
-        few = {"turns": QUICK.turns} if plan.quick else {}
-        results["growth"] = measure_growth(plan.backends, **few)
-        results["threads"] = measure_threads(plan.backends, **few)
+        results["growth"] = measure_growth(plan.backends, effort.turns)
+        results["threads"] = measure_threads(plan.backends, turns=min(effort.turns, 9))
     if "startup" in parts:
         results["startup"] = measure_startup(plan.backends)
     if "pipeline" in parts and is_installed():

@@ -3,7 +3,7 @@
 from mmmgpu.bench.timing import COPY, REFERENCE
 
 WORKS = f"{'':32}  median ms          quartiles   cpu ms  x ref  x peer    bytes    flops"
-WORKS += "    first transfer  differs"
+WORKS += "    first     load  differs"
 OURS = ("warp", "opencl", "ours", "adjoint")
 
 
@@ -12,7 +12,9 @@ def work_tables(results):
 
     cpu: of all threads, the least of all runs; threads that spin count.
     x ref, x peer: how many times faster than the reference, and than the best other library.
-    bytes, flops: shares of the copy bandwidth and of the arithmetic peak. first, transfer: [ms].
+    bytes, flops: shares of the copy bandwidth and of the arithmetic peak.
+    first, load: [ms] the first run, which compiles or fetches kernels; and to bring arrays to the
+        device and results back, of wholes with all that is prepared once.
     differs: from the reference, as a share of its scale.
     """
     for work in results["works"].values():

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mmmgpu.bench.growth import LINEAR
 from mmmgpu.bench.timing import COPY, REFERENCE
 
 BACKENDS = ("warp", "opencl")
@@ -82,8 +83,9 @@ def apart(results):
 
 
 def steepest(results):
-    """The largest exponent of growth in pixels, frames and corpus length."""
-    axes = (results.get("growth", {}).get(axis, {}) for axis in ("pixels", "frames", "corpus rows"))
+    """The largest exponent of growth with what the time is to grow linearly."""
+    grown = results.get("growth", {}).items()
+    axes = [found for axis, found in grown if axis.startswith(LINEAR)]
     return max((found["exponent"] for axis in axes for found in axis.values()), default=None)
 
 
@@ -134,8 +136,13 @@ TARGETS = (
     Target("backends apart by at most", 2, apart, most=True),
     Target("steepest growth, exponent", 1.1, steepest, most=True),
     Target("threads, forward_warp", 1.7, gain("splat")),
+    Target("threads, fill_holes", 1.7, gain("fill")),
+    Target("threads, normal_equations", 1.7, gain("equations")),
     Target("threads, distance_scan", 1.7, gain("scan")),
     Target("threads, dense RBF", 1.7, gain("rbf")),
+    Target("threads, piecewise_warp", 1.7, gain("piecewise")),
+    Target("threads, synthesis", 1.7, gain("synthesis")),
+    Target("threads, analysis", 1.7, gain("analysis")),
     Target("threads, blend, of a copy's gain", 0.9, gain_beside_copy("blend")),
     Target("threads, sample, of a copy's gain", 0.9, gain_beside_copy("sample")),
     Target("first frame, full cache [s]", 1, slowest_start, most=True),

@@ -17,10 +17,11 @@ from mmmgpu.backends import default_threads
 from mmmgpu.bench import cases
 from mmmgpu.bench.kernels import on_backend
 from mmmgpu.bench.machine import COPIED, copy_of, product
+from mmmgpu.bench.pictures import picture_works
 from mmmgpu.bench.timing import COPY, timed
 from mmmgpu.errors import InputError
 
-COMPUTE_BOUND = ("splat", "scan", "rbf")
+COMPUTE_BOUND = ("splat", "fill", "equations", "scan", "rbf", "piecewise", "synthesis", "analysis")
 MEMORY_BOUND = ("blend", "sample")  # beside a copy of as many bytes each
 MACHINE = {"copy": lambda: copy_of(2 * COPIED, default_threads()), "product": product}
 
@@ -92,10 +93,13 @@ def answer():
 
 
 def made(name):
-    """What a name stands for, to be timed: of `MACHINE`, or a case and a backend or a copy."""
+    """What a name stands for, to be timed: of `MACHINE`, or a work and a backend or a copy."""
     if name in MACHINE:
         return MACHINE[name]()
     key, who = name.split(", ")
+    wholes = picture_works([who], ())
+    if key in wholes:
+        return wholes[key]().contenders[who].load()
     case = getattr(cases, key)(np.random.default_rng(0))
     return copy_of(case.bytes, default_threads()) if who == COPY else on_backend(case, who).load()
 

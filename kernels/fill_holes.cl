@@ -33,7 +33,7 @@ float share(const float weight, const float threshold, const int finest)
 }
 
 __kernel void pull(
-    __global const int *holes,     /* (batch,) 0 where an image has no holes: it is skipped */
+    __global const int *holes,     /* (batch,) 0 where an image has no holes: it has no levels */
     __global const float *value,   /* (batch, h, w, C), a level */
     __global const float *weight,  /* (batch, h, w) */
     const float threshold,
@@ -44,6 +44,7 @@ __kernel void pull(
     const int first,
     const int count,
     /* outputs */
+    __global float *filled,        /* (batch, h, w, C), in the finest level the valid are written */
     __global float *coarse,        /* (batch, ceil(h / 2), ceil(w / 2), C) */
     __global float *number)        /* (batch, ceil(h / 2), ceil(w / 2)), valid pixels in the block */
 {
@@ -53,10 +54,15 @@ __kernel void pull(
     const int rows = (height + 1) / 2;
     const int columns = (width + 1) / 2;
     const int b = (first + tid) / rows;
-    if (holes[b] == 0)
-        return;
     const int y = 2 * ((first + tid) % rows);
     const int upper = (b * height + y) * width;
+    if (finest) {
+        const int end = (upper + (y + 1 < height ? 2 : 1) * width) * channels;
+        for (int i = upper * channels; i < end; ++i)
+            filled[i] = value[i];
+    }
+    if (holes[b] == 0)
+        return;
     const int lower = (b * height + min(y + 1, height - 1)) * width;
     for (int column = 0; column < columns; ++column) {
         const int x = 2 * column;

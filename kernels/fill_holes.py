@@ -7,7 +7,7 @@ above it. Every thread takes one row.
 
 import warp as wp
 
-from mmmgpu.kernels.lanes import LANES, address, get, one_at
+from mmmgpu.kernels.lanes import LANES, address, get, one_at, put
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,7 +63,7 @@ def share(weight: float, threshold: float, finest: int):
 
 @wp.kernel
 def pull(
-    holes: wp.array[int],  # (batch,) 0 where an image has no holes: it is skipped
+    holes: wp.array[int],  # (batch,) 0 where an image has no holes: it has no levels
     value: wp.array[float],  # (batch, h, w, C), a level
     weight: wp.array[float],  # (batch, h, w)
     threshold: float,
@@ -74,6 +74,7 @@ def pull(
     first: int,
     count: int,
     # outputs
+    filled: wp.array[float],  # (batch, h, w, C), in the finest level the valid are written
     coarse: wp.array[float],  # (batch, ceil(h / 2), ceil(w / 2), C)
     number: wp.array[float],  # (batch, ceil(h / 2), ceil(w / 2)), valid pixels in the block
 ):
@@ -83,10 +84,18 @@ def pull(
     rows = (height + 1) / 2
     columns = (width + 1) / 2
     b = (first + tid) / rows
-    if holes[b] == 0:
-        return
     y = 2 * ((first + tid) % rows)
     upper = (b * height + y) * width
+    if finest == 1:
+        begin = upper * channels
+        end = begin + wp.min(height - y, 2) * width * channels
+        whole = end - (end - begin) % LANES
+        for i in range(begin, whole, LANES):
+            put(filled, i, get(value, i))
+        for i in range(whole, end):
+            filled[i] = value[i]
+    if holes[b] == 0:
+        return
     lower = (b * height + wp.min(y + 1, height - 1)) * width
     for column in range(columns):
         x = 2 * column

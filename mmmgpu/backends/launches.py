@@ -61,7 +61,7 @@ class Prototypes:
 
 @dataclass(frozen=True)
 class Launches(ABC):
-    """The operations of `mmmgpu.backends.Backend`, over five things that a runtime can do."""
+    """The operations of `mmmgpu.backends.Backend`, over four things that a runtime can do."""
 
     workers: int  # accumulators of a forward warp
     # what each thread of the host needed last, so that not every frame allocates it anew
@@ -78,10 +78,6 @@ class Launches(ABC):
         """An uninitialised device array."""
 
     @abstractmethod
-    def copy(self, target: Any, source: Any, first: int, count: int) -> None:
-        """Copy the items `first` ... `first + count - 1` of the first axis."""
-
-    @abstractmethod
     def launcher(
         self, kernel: str, inputs: list[Any], outputs: list[Any]
     ) -> Callable[[int, int], None]:
@@ -95,7 +91,7 @@ class Launches(ABC):
         """Call `work(first, n)` for contiguous parts of `count` items, on all threads."""
 
     def within_memory(self, allocate: Callable[[], Any]) -> Any:
-        """What `allocate()` gives; where memory is short, this thread's scratch is given up for it."""
+        """What `allocate()` gives; where memory is short, this thread's scratch goes first."""
         try:
             return allocate()
         except DeviceMemoryError:
@@ -281,9 +277,9 @@ class Launches(ABC):
         kept = self.scratch.__dict__
         if kept.get("shapes") != shapes or kept["workers"] < workers:
             kept.clear()  # before more is asked for
-            arrays = [self.empty(workers, *shape, dtype=dtype) for shape, dtype in shapes]
-            kept |= {"shapes": shapes, "workers": workers, "arrays": arrays}
-        arrays = kept["arrays"]
+            kept["arrays"] = [self.empty(workers, *s, dtype=dtype) for s, dtype in shapes]
+            kept |= {"shapes": shapes, "workers": workers}
+        arrays: list[Any] = kept["arrays"]
         return arrays
 
     def piecewise_warp(
@@ -309,14 +305,13 @@ class Launches(ABC):
         self, field: Any, holes: Any, levels: list[Level], first: int, count: int
     ) -> None:
         """Fill the images `first` ... `first + count - 1`: down the levels, and up again."""
-        self.copy(levels[0].value, field, first, count)
         pairs = list(itertools.pairwise(levels))
         for fine, coarse in pairs:
             rows = coarse.value.shape[1]
-            finest = int(fine is levels[0])
-            inputs = [holes, fine.value, fine.weight, fine.threshold, finest]
-            inputs += fine.value.shape[1:]
-            outputs = [coarse.value, coarse.weight]
+            finest = fine is levels[0]
+            inputs = [holes, field if finest else fine.value, fine.weight, fine.threshold]
+            inputs += [int(finest), *fine.value.shape[1:]]
+            outputs = [fine.value, coarse.value, coarse.weight]
             self.launch("fill_holes.pull", first * rows, count * rows, inputs, outputs)
         for fine, coarse in reversed(pairs):
             rows = fine.value.shape[1]

@@ -118,11 +118,6 @@ class Warp(Launches):
 
         return self.within_memory(attempt)
 
-    def copy(self, target: Any, source: Any, first: int, count: int) -> None:
-        size = source.size // source.shape[0]
-        with _faults_of(self.device):
-            wp.copy(target, source, first * size, first * size, count * size)
-
     def launcher(
         self, kernel: str, inputs: list[Any], outputs: list[Any]
     ) -> Callable[[int, int], None]:

@@ -181,12 +181,6 @@ class OpenCL(Launches):
 
         return self.within_memory(attempt)
 
-    def copy(self, target: Any, source: Any, first: int, count: int) -> None:
-        row = source.size // source.shape[0] * source.dtype.itemsize
-        span = {"src_offset": first * row, "dst_offset": first * row, "byte_count": count * row}
-        with _faults_of(self.name):
-            cl.enqueue_copy(self.queue, target.data, source.data, **span)
-
     def launcher(
         self, kernel: str, inputs: list[Any], outputs: list[Any]
     ) -> Callable[[int, int], None]:
