@@ -20,8 +20,8 @@ from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 from mmmgpu.voices import is_installed
 
-# of the record; 4: growth and threads of fewer works; 3: single turns were not kept, references did not take turns, growth by the best;
-# 2: no pause for OpenBLAS's threads; 1: short runs were not repeated
+# of the record; 4: growth and threads of fewer works; 3: single turns were not kept, references did
+# not take turns, growth by the best; 2: no pause for OpenBLAS's threads; 1: short runs once
 VERSION = 5
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
 
