@@ -22,7 +22,7 @@ def draw_growth(growth, threads, path):
         raise InputError(f"{path}: must be named .svg")
     with mpl.rc_context({"svg.hashsalt": "mmmgpu", "svg.fonttype": "none", "font.size": 8}):
         rows = math.ceil((len(growth) + 1) / ACROSS)
-        figure = Figure(figsize=(3 * ACROSS + 3, 2.8 * rows), layout="constrained")
+        figure = Figure(figsize=(3 * ACROSS + 4, 2.8 * rows), layout="constrained")
         charts = figure.subplots(rows, ACROSS).ravel()
         last = charts[len(growth)]
         for axes in charts[len(growth) + 1 :]:
@@ -47,7 +47,8 @@ def draw_threads(axes, threads):
     axes.set(xlabel="threads", ylabel="times faster than one")
     tick(axes.xaxis, counts)
     tick(axes.yaxis, counts)
-    axes.legend(title="gain", frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "ncols": 2, "fontsize": 7}
+    axes.legend(title="gain", frameon=False, **beside)
 
 
 def tick(axis, counts):
@@ -58,4 +59,7 @@ def tick(axis, counts):
 
 def short(number):
     """A count in few letters."""
-    return f"{number / 1000:.3g}k" if math.log10(number) >= 3 else str(number)
+    for size, letter in ((10**6, "M"), (10**3, "k")):
+        if number >= size:
+            return f"{number / size:.3g}{letter}"
+    return str(number)

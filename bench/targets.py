@@ -90,15 +90,19 @@ def steepest(results):
 
 
 def gain(key):
-    """What all threads gain over one, the backend that is fastest with all of them."""
+    """What all threads gain over one, the backend that is fastest with all of them.
+
+    Where none was timed, the one that gains most.
+    """
 
     def value(results):
         gains = results.get("threads", {}).get("gain", {})
-        there = [b for b in BACKENDS if f"{key}, {b}" in gains]
-        if not there:
-            return None
-        best = min(there, key=lambda b: [row["median_ms"] for row in rows_of(results, key, b)])
-        return gains[f"{key}, {best}"][-1]
+        found = [
+            ([row["median_ms"] for row in rows_of(results, key, b)], -gains[f"{key}, {b}"][-1])
+            for b in BACKENDS
+            if f"{key}, {b}" in gains
+        ]
+        return -min(found)[1] if found else None
 
     return value
 
