@@ -27,6 +27,7 @@ either of them, the flows from there say little.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,6 +35,7 @@ from numpy.typing import NDArray
 
 from mmmgpu.backends import Backend, default_threads, get_backend
 from mmmgpu.basis import LIP, Basis
+from mmmgpu.batches import in_parts
 from mmmgpu.correspondence import Correspondence
 from mmmgpu.parallel import Cancelled, map_ordered
 
@@ -93,8 +95,7 @@ class FlowScan:
         weight, found = self._kernels.to_device(self._weight), []
         for r, side in enumerate(self._sides):
             queries = calibrated(side.queries, side.corpus, calibration, r)
-            given = self._kernels.to_device(queries), side.on_device, weight
-            found.append(self._kernels.to_host(self._kernels.distance_scan(*given)))
+            found.append(distances(self._kernels, queries, side.on_device, weight))
         return np.array(found, np.float64)
 
     def calibrate(self, chosen: Numbers) -> Calibration:
@@ -108,6 +109,16 @@ class FlowScan:
             wanted = side.z @ linear.T + offset - KEPT * side.z
             kept[r], mixture[r] = KEPT, wanted @ side.directions
         return Calibration(kept, mixture)
+
+
+def distances(kernels: Backend, queries: F32, corpus: Any, weights: Any) -> F32:
+    """Of fields (K, P, C) from a corpus on the device, (K, N): in parts if memory asks for it."""
+
+    def scanned(part: slice) -> F32:
+        some = kernels.to_device(queries[part])
+        return kernels.to_host(kernels.distance_scan(some, corpus, weights))
+
+    return np.concatenate(in_parts(scanned, len(queries)))
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from mmmgpu.analysis import solve_simplex
 from mmmgpu.backends import get_backend
 from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import MOUTH, Basis
-from mmmgpu.flow_matching import FlowScan, View, synthetic_flows
+from mmmgpu.batches import in_parts
+from mmmgpu.flow_matching import FlowScan, View, distances, synthetic_flows
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
 F32 = NDArray[np.float32]
@@ -213,9 +214,7 @@ class _TextureScan:
             mine = np.flatnonzero(self._view == r)
             if len(mine):
                 made[mine] = self._syntheses(r, mine, candidates)
-        queries = self._kernels.to_device(made)
-        scanned = self._kernels.distance_scan(queries, self._frames, self._weight)
-        return np.asarray(self._kernels.to_host(scanned), np.float64)
+        return distances(self._kernels, made, self._frames, self._weight).astype(np.float64)
 
     def _seen(self, image: F32) -> F32:
         """`image` (h', w', 3), smoothed, at the pixels that count, (P, 3)."""
@@ -227,19 +226,28 @@ class _TextureScan:
 
         A frame that is the candidate of several prototypes is warped once.
         """
-        k, flows = self._kernels, self._flows[mine]
+        flows = self._flows[mine]
         weights = np.zeros((len(mine), len(self._target.images)), np.float32)
         np.add.at(weights.T, candidates, self._beta[:, mine])
         made = np.zeros((len(mine), 3, *flows.shape[2:]), np.float32)
-        everywhere = k.to_device(np.ones(flows.shape[2:], np.float32))
         for frames, held in self._hold(r, np.flatnonzero(weights.any(axis=0))):
             shares = weights[:, frames]
             some = np.flatnonzero(shares.any(axis=1))
-            to = k.to_device(flows[some])
-            part: F32 = k.to_host(k.mix_prototypes(held, to, shares[some], everywhere))
-            made[some] += part
+            made[some] += self._mixed(held, flows[some], shares[some])
         width = self._target.w_t.shape[1]
         return np.stack([self._seen(picture(one, width)) for one in made])
+
+    def _mixed(self, held: Any, flows: F32, shares: F32) -> F32:
+        """Mixtures (K, 3, h', pitch) of what is held; in parts if need be."""
+        k = self._kernels
+        everywhere = k.to_device(np.ones(flows.shape[2:], np.float32))
+
+        def mixed(part: slice) -> F32:
+            return k.to_host(
+                k.mix_prototypes(held, k.to_device(flows[part]), shares[part], everywhere)
+            )
+
+        return np.concatenate(in_parts(mixed, len(flows)))
 
     def _hold(self, r: int, frames: Numbers) -> list[tuple[Numbers, Any]]:
         """Frames held for view r, `frames` (n,) among them: most were candidates before."""

@@ -1,6 +1,7 @@
 """Matching by synthesis against slow versions, small worlds made to measure, and known truth."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,9 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from performer_pairs import found, make_pair, target_of, views_of
 from tiny_pair import COUNT, FRAMES, tiny_pair
 
-from mmmgpu import matching
+from mmmgpu import flow_matching, matching
 from mmmgpu.analysis import TEXTURE_RIDGE, solve_simplex
 from mmmgpu.backends import get_backend
+from mmmgpu.errors import DeviceMemoryError
 from mmmgpu.flow_matching import synthetic_flows
 from mmmgpu.matching import match_prototypes, texture_coordinates
 
@@ -53,6 +55,29 @@ def test_the_texture_scan_is_equations_9_and_10(tiny, backend):
         for before in ([5] * 5, [3, 2, 2, 2, 4], [3, 1, 2, 6, 0]):
             scan(np.array(before))  # what was made before is not taken for what is new
             assert_allclose(scan(candidates), wanted, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("operation", "batch"), [("distance_scan", 0), ("mix_prototypes", 1)])
+def test_scans_of_what_does_not_fit_are_made_in_parts(tiny, backend, monkeypatch, operation, batch):
+    beta = np.random.default_rng(1).dirichlet(np.ones(COUNT), COUNT).T
+    scans = (
+        partial(scan_of(tiny, beta, backend), np.array([3, 1, 6, 6, 0])),
+        flow_matching.FlowScan(tiny.source, tiny.views, backend=backend),
+    )
+    whole = [scan() for scan in scans]
+    runtime, refused = type(get_backend(backend)), []
+    real = getattr(runtime, operation)
+
+    def one_at_a_time(self, *given):
+        if given[batch].shape[0] > 1:
+            refused.append(given[batch].shape)
+            raise DeviceMemoryError("not enough memory")
+        return real(self, *given)
+
+    monkeypatch.setattr(runtime, operation, one_at_a_time)
+    for scan, desired in zip(scans, whole, strict=True):
+        assert_array_equal(scan(), desired)
+    assert refused
 
 
 @pytest.mark.parametrize("equal", [False, True])
