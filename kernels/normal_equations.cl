@@ -8,13 +8,11 @@
 
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
-#define LANES 16
+#include "lanes.cl"
+
 #define PIECE 1024 /* values: of 50 images they fit into L2, of eight into L1 */
 #define ROWS 4
 #define PRODUCTS (ROWS * ROWS)
-
-/* A vector anywhere in an image. */
-typedef float float16u __attribute__((ext_vector_type(16), aligned(4)));
 
 float sum(const float16 v)
 {
@@ -61,8 +59,8 @@ __kernel void multiply(
         float16 b[ROWS];
 #pragma unroll
         for (int j = 0; j < ROWS; ++j) {
-            a[j] = *(__global const float16u *)(left[j] + i);
-            b[j] = *(__global const float16u *)(right[j] + i);
+            a[j] = get(left[j] + i);
+            b[j] = get(right[j] + i);
         }
 #pragma unroll
         for (int j = 0; j < PRODUCTS; ++j)

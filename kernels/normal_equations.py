@@ -17,7 +17,7 @@ ROWS = wp.constant(4)  # of a block
 
 
 @wp.func
-def row_of(
+def image_at(
     images: wp.array[float], wanted: wp.array[float], r: int, number: int, size: int, start: int
 ):
     """The address of an image, or of what is wanted, from value `start` on."""
@@ -26,7 +26,7 @@ def row_of(
 
 
 @wp.func
-def keep(
+def store(
     parts: wp.array[float],
     start: int,
     r: int,
@@ -74,13 +74,13 @@ def multiply(
     end = wp.uint64(4 * whole)
     start = piece * (number + 1) * number
     r = ROWS * row
-    a0 = row_of(images, wanted, r, number, size, begin)
-    a1 = row_of(images, wanted, r + 1, number, size, begin)
-    a2 = row_of(images, wanted, r + 2, number, size, begin)
-    a3 = row_of(images, wanted, r + 3, number, size, begin)
+    a0 = image_at(images, wanted, r, number, size, begin)
+    a1 = image_at(images, wanted, r + 1, number, size, begin)
+    a2 = image_at(images, wanted, r + 2, number, size, begin)
+    a3 = image_at(images, wanted, r + 3, number, size, begin)
     for c in range(ROWS * column, wp.min(ROWS * column + ROWS, number), 2):
-        b0 = row_of(images, wanted, c, number, size, begin)
-        b1 = row_of(images, wanted, c + 1, number, size, begin)
+        b0 = image_at(images, wanted, c, number, size, begin)
+        b1 = image_at(images, wanted, c + 1, number, size, begin)
         total00 = vec16()
         total10 = vec16()
         total20 = vec16()
@@ -106,14 +106,14 @@ def multiply(
             total21 += wp.cw_mul(x2, y1)
             total31 += wp.cw_mul(x3, y1)
             i += wp.uint64(4 * LANES)
-        keep(parts, start, r, c, number, total00, a0, b0, whole, length)
-        keep(parts, start, r + 1, c, number, total10, a1, b0, whole, length)
-        keep(parts, start, r + 2, c, number, total20, a2, b0, whole, length)
-        keep(parts, start, r + 3, c, number, total30, a3, b0, whole, length)
-        keep(parts, start, r, c + 1, number, total01, a0, b1, whole, length)
-        keep(parts, start, r + 1, c + 1, number, total11, a1, b1, whole, length)
-        keep(parts, start, r + 2, c + 1, number, total21, a2, b1, whole, length)
-        keep(parts, start, r + 3, c + 1, number, total31, a3, b1, whole, length)
+        store(parts, start, r, c, number, total00, a0, b0, whole, length)
+        store(parts, start, r + 1, c, number, total10, a1, b0, whole, length)
+        store(parts, start, r + 2, c, number, total20, a2, b0, whole, length)
+        store(parts, start, r + 3, c, number, total30, a3, b0, whole, length)
+        store(parts, start, r, c + 1, number, total01, a0, b1, whole, length)
+        store(parts, start, r + 1, c + 1, number, total11, a1, b1, whole, length)
+        store(parts, start, r + 2, c + 1, number, total21, a2, b1, whole, length)
+        store(parts, start, r + 3, c + 1, number, total31, a3, b1, whole, length)
 
 
 @wp.kernel

@@ -52,7 +52,7 @@ class Backend(Protocol):
         """(M, H, W, C), (B, M) -> (B, H, W, C)."""
 
     def normal_equations(self, images: Any, wanted: Any, /) -> Any:
-        """(M, ...), (...) of as many values -> (M + 1, M): the Gram matrix, then the right side."""
+        """(M, ...), (...) of as many values -> (M + 1, M): Gram matrix, then right-hand side."""
 
     def sample(self, field: Any, points: Any, /) -> Any:
         """(B, H, W, C), (B, N, 2) -> (B, N, C)."""
