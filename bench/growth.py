@@ -27,28 +27,14 @@ def analyses_of(name, prototypes=16, side=128, frames=4):
     return work.contenders[name].load()
 
 
-def operation(make, size, **fixed):
-    """Makes an operation to be timed: its case in a size that may be several of its arguments."""
+def operation(make, *sizes, **fixed):
+    """Makes an operation to be timed: a case of which the arguments `sizes` are what grows."""
 
     def of(name, n):
-        return on_backend(make(np.random.default_rng(0), **size(n), **fixed), name).load()
+        case = make(np.random.default_rng(0), **dict.fromkeys(sizes, n), **fixed)
+        return on_backend(case, name).load()
 
     return of
-
-
-def side(n):
-    """Of square pictures."""
-    return {"height": n, "width": n}
-
-
-def rows(n):
-    """Of the corpus."""
-    return {"corpus": n}
-
-
-def pictures(n):
-    """Of a batch."""
-    return {"batch": n}
 
 
 def square(n):
@@ -57,6 +43,7 @@ def square(n):
 
 
 SIDES, NUMBERS = (64, 128, 256), (8, 16, 32)
+SIDE = "height", "width"
 AXES = {  # what grows, of which work: sizes, what is timed, what is counted
     "pixels, synthesis": (SIDES, lambda name, n: pictures_of(name, side=n), square),
     "prototypes, synthesis": (NUMBERS, lambda name, n: pictures_of(name, prototypes=n), int),
@@ -67,23 +54,23 @@ AXES = {  # what grows, of which work: sizes, what is timed, what is counted
     ),
     "pixels, analysis": (SIDES, lambda name, n: analyses_of(name, side=n), square),
     "prototypes, analysis": (NUMBERS, lambda name, n: analyses_of(name, prototypes=n), int),
-    "pixels, forward_warp": (SIDES, operation(cases.splat, side, batch=16), square),
-    "pixels, fill_holes": (SIDES, operation(cases.fill, side, batch=16), square),
-    "pixels, blend": (SIDES, operation(cases.blend, side), square),
-    "pixels, normal_equations": (SIDES, operation(cases.equations, side), square),
+    "pixels, forward_warp": (SIDES, operation(cases.splat, *SIDE, batch=16), square),
+    "pixels, fill_holes": (SIDES, operation(cases.fill, *SIDE, batch=16), square),
+    "pixels, blend": (SIDES, operation(cases.blend, *SIDE), square),
+    "pixels, normal_equations": (SIDES, operation(cases.equations, *SIDE), square),
     "images, normal_equations": (
         NUMBERS,
-        operation(cases.equations, lambda n: {"number": n}),
+        operation(cases.equations, "number"),
         int,
     ),
-    "pixels, sample": ((256, 512, 1024), operation(cases.sample, side), square),
+    "pixels, sample": ((256, 512, 1024), operation(cases.sample, *SIDE), square),
     "corpus rows, distance_scan": (
         (128, 512, 2048),
-        operation(cases.scan, rows, queries=16, points=4096),
+        operation(cases.scan, "corpus", queries=16, points=4096),
         int,
     ),
-    "pixels, evaluate_rbf": (SIDES, operation(cases.rbf, side), square),
-    "pictures, piecewise_warp": ((4, 16, 64), operation(cases.piecewise, pictures), int),
+    "pixels, evaluate_rbf": (SIDES, operation(cases.rbf, *SIDE), square),
+    "pictures, piecewise_warp": ((4, 16, 64), operation(cases.piecewise, "batch"), int),
 }
 LINEAR = ("pixels", "frames", "pictures", "corpus rows")  # with what the time is to grow so
 

@@ -12,6 +12,7 @@ from mmmgpu import operations, synthesis
 from mmmgpu.analysis import analyze, prepare_analysis
 from mmmgpu.backends import get_backend
 from mmmgpu.backends.opencl_memory import OwnMemory
+from mmmgpu.bench.timing import as_tuple
 from mmmgpu.synthesis import prepare_synthesis, synthesize_batch
 
 WORKERS = 64  # accumulators: many, as on a GPU
@@ -30,10 +31,6 @@ def own(shared):
 def coordinates(frames):
     rng = np.random.default_rng(0)
     return rng.normal(0, 0.4, (frames, 4)), rng.dirichlet(np.ones(5), frames)
-
-
-def as_tuple(result):
-    return result if isinstance(result, tuple) else (result,)
 
 
 @pytest.mark.parametrize("name", CALLS)
