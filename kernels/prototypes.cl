@@ -85,10 +85,9 @@ __kernel void mix_prototypes(
             if (frames > 1 || group == worker)
                 for (int i = 0; i < 2 * area; ++i)
                     to[i] = from[i];
-            for (int i = 0; i < 3 * area; ++i)
-                mixed[3 * (job + f) * area + i] = 0.0f;
             arrived[job + f] = 1;
         }
+        int begun = 0; /* mixtures that have a prototype, as bits */
         for (int part = parts[group]; part < parts[group + 1]; ++part) {
             const int m = members[part];
             orient(m, own, shares, firsts, neighbours, rows, targets, starts, row_taps, row_shares,
@@ -96,12 +95,18 @@ __kernel void mix_prototypes(
             for (int f = 0; f < number; ++f) {
                 const float weight = weights[together * part + f] / WHITE;
                 __global const float *right = residual + 2 * f * nodes;
-                if (weight != 0.0f &&
-                    carry(textures + COLOUR * m * area / LANES, height, width, pitch, right,
+                if (weight == 0.0f)
+                    continue;
+                if (carry(textures + COLOUR * m * area / LANES, height, width, pitch, right,
                           right + nodes, hole, weight, scale, total, cells, opens, places, steps,
-                          holes, mixed + 3 * (job + f) * area) == 0)
+                          holes, begun >> f & 1, mixed + 3 * (job + f) * area) == 0)
                     arrived[job + f] = 0;
+                begun |= 1 << f;
             }
         }
+        for (int f = 0; f < number; ++f)
+            if ((begun >> f & 1) == 0)
+                for (int i = 0; i < 3 * area; ++i)
+                    mixed[3 * (job + f) * area + i] = 0.0f;
     }
 }

@@ -94,9 +94,8 @@ def mix_prototypes(
                 to = there + 2 * f * (area + LANES)
                 for i in range(0, 2 * area, LANES):
                     put(field, to + i, get(flows, 2 * ((job + f) % frames) * area + i))
-            for i in range(0, 3 * area, LANES):
-                put(mixed, 3 * (job + f) * area + i, vec16())
             arrived[job + f] = 1
+        begun = int(0)  # mixtures that have a prototype, as bits
         for part in range(parts[group], parts[group + 1]):
             m = members[part]
             orient(
@@ -147,8 +146,14 @@ def mix_prototypes(
                         step,
                         holes,
                         list,
+                        (begun >> f) & 1,
                         mixed,
                         3 * (job + f) * area,
                     )
                     if some == 0:
                         arrived[job + f] = 0
+                    begun |= 1 << f
+        for f in range(number):
+            if ((begun >> f) & 1) == 0:
+                for i in range(0, 3 * area, LANES):
+                    put(mixed, 3 * (job + f) * area + i, vec16())

@@ -94,9 +94,10 @@ void splat(const int pitch, __global const int *places, __global const float *st
         }
 }
 
-void add(__global float *out, const float16 v)
+/* Add to what is there, or begin it. */
+void add(__global float *out, const float16 v, const int begun)
 {
-    put(out, get(out) + v);
+    put(out, begun ? get(out) + v : v);
 }
 
 /* Add half of the sums over blocks of 2 x 2, or begin them. */
@@ -106,13 +107,13 @@ void add_pairs(__global float *cell, const float16 v, const int more)
     *(__global float8u *)cell = more ? *(__global float8u *)cell + sum : sum;
 }
 
-/* Add the means of row y to a picture and empty their sums; begin the pyramid.
+/* Add the means of row y to a picture that is `begun`, or begin it; begin the pyramid.
  *
- * Pixels that are asked for and received too little go to the list of holes, of which there are
- * `found`. Returns how many there are then.
+ * Their sums are emptied. Pixels that are asked for and received too little go to the list of holes,
+ * of which there are `found`. Returns how many there are then.
  */
 int show(__global float *total, const int y, const int h, const int w, const int pitch,
-         const float hole, const float weight, __global const float *scale,
+         const float hole, const float weight, __global const float *scale, const int begun,
          __global float *out, __global float *cells, __global int *holes, int found)
 {
     const int area = h * pitch;
@@ -139,9 +140,9 @@ int show(__global float *total, const int y, const int h, const int w, const int
                 if (lacks[j])
                     holes[found++] = i + j;
         const float16 part = weight * asked;
-        add(out + i, part * red);
-        add(out + area + i, part * green);
-        add(out + 2 * area + i, part * blue);
+        add(out + i, part * red, begun);
+        add(out + area + i, part * green, begun);
+        add(out + 2 * area + i, part * blue, begun);
         __global float *cell = cells + y / 2 * across + x / 2;
         add_pairs(cell, red, y % 2);
         add_pairs(cell + step, green, y % 2);
@@ -165,12 +166,15 @@ void mend(__global const int *holes, const int found, const int h, const int w, 
     }
 }
 
-/* Add a prototype, carried along a flow, to a picture. Returns 0 where nothing of it arrives. */
+/* Add a prototype, carried along a flow, to a picture that is `begun`, or begin it.
+ *
+ * Returns 0 where nothing of it arrives.
+ */
 int carry(__global const ushort16 *texture, const int h, const int w, const int pitch,
           __global const float *right, __global const float *down, const float hole,
           const float weight, __global const float *scale, __global float *total,
           __global float *cells, __global int *opens, __global int *places, __global float *steps,
-          __global int *holes, __global float *out)
+          __global int *holes, const int begun, __global float *out)
 {
     const int ring = reach(down, h, pitch, opens);
     int shown = 0;
@@ -178,7 +182,7 @@ int carry(__global const ushort16 *texture, const int h, const int w, const int 
     for (int y = 0; y <= h; ++y) {
         for (; shown < opens[y]; ++shown)
             found = show(total + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN), shown, h, w,
-                         pitch, hole, weight, scale, out, cells, holes, found);
+                         pitch, hole, weight, scale, begun, out, cells, holes, found);
         if (y < h) {
             aim(texture + COLOUR * y * pitch / LANES, y, h, w, pitch, right + y * pitch,
                 down + y * pitch, ring, places, steps);

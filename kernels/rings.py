@@ -242,6 +242,7 @@ def show(
     hole: float,
     weight: float,
     scale: wp.array[float],
+    begun: int,
     out: wp.array[float],
     start: int,
     cells: wp.array[float],
@@ -250,15 +251,19 @@ def show(
     list: int,
     found: int,
 ):
-    """Add the means of row `y` to a picture and empty their sums; begin the pyramid.
+    """Add the means of row `y` to a picture that is `begun`, or begin it; begin the pyramid.
 
-    Pixels that are asked for and received too little go to the list of holes, of which there are
-    `found`. Returns how many there are then.
+    Their sums are emptied. Pixels that are asked for and received too little go to the list of
+    holes, of which there are `found`. Returns how many there are then.
     """
     area = h * pitch
     across = pitch_of((w + 1) / 2)
     step = (h + 1) / 2 * across
     number = int(found)
+    if begun == 0:
+        for x in range(0, pitch, LANES):
+            for plane in range(3):
+                put(out, start + plane * area + y * pitch + x, vec16())
     for x in range(0, pitch, LANES):
         t = here + COLOUR * (x + LEFT)
         a = get(total, t)
@@ -340,10 +345,14 @@ def carry(
     step: int,
     holes: wp.array[int],
     list: int,
+    begun: int,
     out: wp.array[float],
     start: int,
 ):
-    """Add a prototype, carried along a flow, to a picture. Returns 0 where nothing arrives."""
+    """Add a prototype, carried along a flow, to a picture that is `begun`, or begin it.
+
+    Returns 0 where nothing arrives.
+    """
     ring = reach(residual, down, h, pitch, opens, open)
     shown = int(0)
     found = int(0)
@@ -360,6 +369,7 @@ def carry(
                 hole,
                 weight,
                 scale,
+                begun,
                 out,
                 start,
                 cells,
