@@ -22,10 +22,13 @@ float sum(const float16 v)
 }
 
 __kernel void multiply(
-    __global const float *images, /* (M, S) */
+    __global const float *images, /* (M, stride) */
     __global const float *wanted, /* (S,) */
     const int number,             /* M */
-    const int size,               /* S */
+    const int stride,
+    const int size,               /* S, values of each */
+    const int before,             /* pieces multiplied before */
+    const int per,                /* pieces of these images, which are multiplied again and again */
     const int first,
     const int count,
     /* outputs */
@@ -47,10 +50,10 @@ __kernel void multiply(
     for (int j = 0; j < ROWS; ++j) {
         const int r = ROWS * row + j;
         const int c = ROWS * column + j;
-        left[j] = r < number ? images + r * size : wanted;
-        right[j] = c < number ? images + c * size : wanted;
+        left[j] = r < number ? images + r * stride : wanted;
+        right[j] = c < number ? images + c * stride : wanted;
     }
-    const int begin = piece * PIECE;
+    const int begin = piece % per * PIECE;
     const int end = begin + PIECE < size ? begin + PIECE : size;
     const int whole = end - (end - begin) % LANES;
     float16 total[PRODUCTS] = {(float16)(0.0f)};
@@ -66,7 +69,7 @@ __kernel void multiply(
         for (int j = 0; j < PRODUCTS; ++j)
             total[j] += a[j / ROWS] * b[j % ROWS];
     }
-    parts += piece * (number + 1) * number;
+    parts += (before + piece) * (number + 1) * number;
 #pragma unroll
     for (int j = 0; j < PRODUCTS; ++j) {
         const int r = ROWS * row + j / ROWS;
