@@ -22,13 +22,10 @@ float sum(const float16 v)
 }
 
 __kernel void multiply(
-    __global const float *images, /* (M, stride) */
+    __global const float *images, /* (M, S) */
     __global const float *wanted, /* (S,) */
     const int number,             /* M */
-    const int stride,
-    const int size,               /* S, values of each */
-    const int before,             /* pieces multiplied before */
-    const int per,                /* pieces of these images, which are multiplied again and again */
+    const int size,               /* S */
     const int first,
     const int count,
     /* outputs */
@@ -50,10 +47,10 @@ __kernel void multiply(
     for (int j = 0; j < ROWS; ++j) {
         const int r = ROWS * row + j;
         const int c = ROWS * column + j;
-        left[j] = r < number ? images + r * stride : wanted;
-        right[j] = c < number ? images + c * stride : wanted;
+        left[j] = r < number ? images + r * size : wanted;
+        right[j] = c < number ? images + c * size : wanted;
     }
-    const int begin = piece % per * PIECE;
+    const int begin = piece * PIECE;
     const int end = begin + PIECE < size ? begin + PIECE : size;
     const int whole = end - (end - begin) % LANES;
     float16 total[PRODUCTS] = {(float16)(0.0f)};
@@ -69,7 +66,7 @@ __kernel void multiply(
         for (int j = 0; j < PRODUCTS; ++j)
             total[j] += a[j / ROWS] * b[j % ROWS];
     }
-    parts += (before + piece) * (number + 1) * number;
+    parts += piece * (number + 1) * number;
 #pragma unroll
     for (int j = 0; j < PRODUCTS; ++j) {
         const int r = ROWS * row + j / ROWS;

@@ -114,9 +114,9 @@ void add_pairs(__global float *cell, const float16 v, const int more)
  */
 int show(__global float *total, const int y, const int h, const int w, const int pitch,
          const float hole, const float weight, __global const float *scale, const int begun,
-         const int apart, __global float *out, __global float *cells, __global int *holes,
-         int found)
+         __global float *out, __global float *cells, __global int *holes, int found)
 {
+    const int area = h * pitch;
     const int across = pitch_of((w + 1) / 2);
     const int step = (h + 1) / 2 * across;
     for (int x = 0; x < pitch; x += LANES) {
@@ -141,8 +141,8 @@ int show(__global float *total, const int y, const int h, const int w, const int
                     holes[found++] = i + j;
         const float16 part = weight * asked;
         add(out + i, part * red, begun);
-        add(out + apart + i, part * green, begun);
-        add(out + 2 * apart + i, part * blue, begun);
+        add(out + area + i, part * green, begun);
+        add(out + 2 * area + i, part * blue, begun);
         __global float *cell = cells + y / 2 * across + x / 2;
         add_pairs(cell, red, y % 2);
         add_pairs(cell + step, green, y % 2);
@@ -166,36 +166,6 @@ void mend(__global const int *holes, const int found, const int h, const int w, 
     }
 }
 
-/* Carry a prototype on along a flow until the rows before `bottom` are shown.
- *
- * at: rows of sums, the next row of the source, the next to show, and how many holes there are.
- * apart: floats between the channels of what is written.
- */
-int4 carry_on(__global const ushort16 *texture, const int h, const int w, const int pitch,
-              __global const float *right, __global const float *down, const float hole,
-              const float weight, __global const float *scale, __global float *total,
-              __global float *cells, __global const int *opens, __global int *places,
-              __global float *steps, __global int *holes, const int4 at, const int bottom,
-              const int begun, const int apart, __global float *out)
-{
-    const int ring = at.x;
-    int y = at.y;
-    int shown = at.z;
-    int found = at.w;
-    while (shown < bottom)
-        if (shown < opens[y]) {
-            found = show(total + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN), shown, h, w,
-                         pitch, hole, weight, scale, begun, apart, out, cells, holes, found);
-            ++shown;
-        } else {
-            aim(texture + COLOUR * y * pitch / LANES, y, h, w, pitch, right + y * pitch,
-                down + y * pitch, ring, places, steps);
-            splat(pitch, places, steps, total);
-            ++y;
-        }
-    return (int4)(ring, y, shown, found);
-}
-
 /* Add a prototype, carried along a flow, to a picture that is `begun`, or begin it.
  *
  * Returns 0 where nothing of it arrives.
@@ -206,9 +176,19 @@ int carry(__global const ushort16 *texture, const int h, const int w, const int 
           __global float *cells, __global int *opens, __global int *places, __global float *steps,
           __global int *holes, const int begun, __global float *out)
 {
-    const int4 at = (int4)(reach(down, h, pitch, opens), 0, 0, 0);
-    const int found = carry_on(texture, h, w, pitch, right, down, hole, weight, scale, total, cells,
-                               opens, places, steps, holes, at, h, begun, h * pitch, out).w;
+    const int ring = reach(down, h, pitch, opens);
+    int shown = 0;
+    int found = 0;
+    for (int y = 0; y <= h; ++y) {
+        for (; shown < opens[y]; ++shown)
+            found = show(total + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN), shown, h, w,
+                         pitch, hole, weight, scale, begun, out, cells, holes, found);
+        if (y < h) {
+            aim(texture + COLOUR * y * pitch / LANES, y, h, w, pitch, right + y * pitch,
+                down + y * pitch, ring, places, steps);
+            splat(pitch, places, steps, total);
+        }
+    }
     if (found == 0)
         return 1;
     if (fill(cells, (h + 1) / 2, (w + 1) / 2) == 0)

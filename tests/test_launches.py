@@ -189,22 +189,3 @@ def test_a_prototype_that_leaves_the_picture_is_an_error(backend):
         moved(backend, images, flows, gone, [0], scale)
     with pytest.raises(InputError, match="no pixel"):
         mixed(backend, images, flows, np.stack([flows[0], gone]), np.ones((2, NUMBER)), scale)
-
-
-@pytest.mark.parametrize("size", [(30, 16), (60, 70), (100, 40)])
-@pytest.mark.parametrize("kind", KINDS)
-def test_equations_without_pictures_are_those_of_moved_pictures(kind, size):
-    k = get_backend("opencl")
-    k.scratch.__dict__.clear()
-    images, flows = prototypes(kind, size)
-    held, used = k.hold_prototypes(images, flows, HOLE), np.array([2, 0, 1, 2])
-    rng = np.random.default_rng(9)
-    flow, wanted = (planes(rng.random((*size, n), dtype=np.float32)) for n in (2, 3))
-    flow = 6 * flow - 3
-    how = k.to_device(planes(some_of(size, rng)[..., None])[0])
-    moved = k.move_prototypes(held, k.to_device(flow[None]), used, how)
-    desired = k.to_host(k.normal_equations(moved, k.to_device(wanted)))
-    padded = k.to_device(np.pad(flow.ravel(), 16))
-    for _ in range(2):
-        actual = k.prototype_equations(held, padded, used, k.to_device(wanted), how)
-        assert_allclose(k.to_host(actual), desired, rtol=1e-5, atol=1e-4)

@@ -29,7 +29,6 @@ MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
 TOGETHER = 4, 2, 1  # mixtures whose flows are re-oriented at once: as many as there are enough of
 TILE = 64  # corpus rows packed at a time
 QUERIES, ROWS = 2, 4  # of one thread of kernels/distance_scan
-BAND = 48  # rows of all moved prototypes at a time, in `prototype_equations`
 PIECE, BLOCK = 1024, 4  # values and rows of one thread of kernels/normal_equations
 
 
@@ -161,8 +160,7 @@ class Launches(ABC):
         parts = self.empty(pieces, number + 1, number)
         products = self.empty(number + 1, number)
         count = pieces * (blocks * (blocks + 1) // 2)
-        given = [images, wanted, number, size, size, 0, pieces]
-        self.launch_all("normal_equations.multiply", count, given, [parts])
+        self.launch_all("normal_equations.multiply", count, [images, wanted, number, size], [parts])
         inputs, count = [parts, pieces, number], (number + 1) * number
         self.launch_all("normal_equations.add_up", count, inputs, [products])
         return products
@@ -223,78 +221,6 @@ class Launches(ABC):
     ) -> Any:
         alone = [np.arange(len(used) + 1), used, np.ones((len(used), 1))]
         return self._mixtures(held, flow, 1, len(used), alone, scale)
-
-    def prototype_equations(
-        self, held: Prototypes, flow: Any, used: NDArray[np.int64], wanted: Any, scale: Any
-    ) -> Any:
-        """`normal_equations` of what `move_prototypes` gives, a band of rows at a time.
-
-        flow: (2, h, pitch) between 16 numbers, as a vector.
-        """
-        number, height, pitch = len(used), held.height, pitch_of(held.width)
-        area, band_area = height * pitch, BAND * pitch
-        size = _pyramid((height + 1) // 2, (held.width + 1) // 2)
-        ring = 1 << (height - 1).bit_length()
-        bands, per = math.ceil(height / BAND), math.ceil(3 * band_area / PIECE)
-        fresh = "equations" not in self.scratch.__dict__
-        if fresh:
-            alone: list[tuple[Any, Any]] = [
-                ((2, held.nodes), np.float32),
-                ((height + 1,), np.int32),
-                ((4,), np.int32),
-                ((ring, pitch + MARGIN, COLOURS + 1), np.float32),
-                ((COLOURS + 1, size), np.float32),
-                ((2, pitch), np.int32),
-                ((7, pitch), np.float32),
-                ((area,), np.int32),
-                ((3, band_area), np.float32),
-                ((3, area), np.float32),
-            ]
-            own = [self.empty(number, *shape, dtype=kind) for shape, kind in alone]
-            shared = [self.empty(n, dtype=np.int32) for n in (number + 1, area, area, number)]
-            shared += [self.empty(3 * band_area), self.empty(3 * area)]
-            pieces = bands * per + math.ceil(3 * area / PIECE)
-            shared += [self.empty(pieces, number + 1, number)]
-            self.scratch.__dict__["equations"] = own, shared
-        own, shared = self.scratch.__dict__["equations"]
-        residual, opens, states, total, cells, places, steps, holes, band, aside = own
-        counts, flags, slots, arrived, band_wanted, aside_wanted, parts = shared
-        textures, *orientation = held.arrays
-        members = self.to_device(used.astype(np.int32))
-        sizes = [number, height, held.width, size, ring, held.nodes]
-        inputs = [flow, *orientation, members, *sizes, int(fresh)]
-        outputs = [residual, opens, states, total, cells, counts, flags]
-        self.launch_all("prototype_equations.begin", number, inputs, outputs)
-        advance = self.launcher(
-            "prototype_equations.advance",
-            [textures, residual, opens, scale, members, *sizes, held.hole, BAND],
-            [total, cells, places, steps, holes, states, flags, band],
-        )
-        set_aside = self.launcher(
-            "prototype_equations.set_aside",
-            [flags, wanted, number, height, held.width, BAND],
-            [band, band_wanted, aside, aside_wanted, slots, counts],
-        )
-        each = 3 * band_area
-        given = [band, band_wanted, number, each, each, 0, per]
-        multiply = self.launcher("normal_equations.multiply", given, [parts])
-        pairs = (number // BLOCK + 1) * (number // BLOCK + 2) // 2
-        for b in range(bands):
-            advance(b * number, number)
-            set_aside(b * (number + 1), number + 1)
-            multiply(b * per * pairs, per * pairs)
-        inputs = [holes, slots, scale, states, number, height, held.width, size]
-        outputs = [cells, aside, arrived]
-        self.launch_all("prototype_equations.finish", number, inputs, outputs)
-        check_some_valid(self.to_host(arrived))
-        rest = 3 * int(self.to_host(counts)[number])
-        more = math.ceil(rest / PIECE)
-        given = [aside, aside_wanted, number, 3 * area, rest, bands * per, max(more, 1)]
-        self.launch_all("normal_equations.multiply", more * pairs, given, [parts])
-        products = self.empty(number + 1, number)
-        inputs, count = [parts, bands * per + more, number], (number + 1) * number
-        self.launch_all("normal_equations.add_up", count, inputs, [products])
-        return products
 
     def mix_prototypes(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
         mixtures, number = weights.shape
