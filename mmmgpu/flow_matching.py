@@ -8,7 +8,7 @@ A is the person with a model, B the new one; S carries A's reference to B's (`co
 In the paper C' is C_syn. That holds B to moving in proportion to A wherever it is: lips of other
 thickness, a longer chin or a badly marked point then count as different speech. What B's flows
 really are tells how the two go together, so C_syn is calibrated on them. With V the first principal
-directions of B's flows under w_f, and z_k = V C_syn,k,
+directions of B's flows under w_f (of 512 of them, if there are more), and z_k = V C_syn,k,
 
     C'_k = V' (T z_k + o) + KEPT (C_syn,k - V' z_k),
 
@@ -44,6 +44,7 @@ Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 DIRECTIONS = 16  # principal directions of B's flows
+LEARNED = 512  # of B's frames that they are found from: time grows with the square of their number
 RIDGE = 1.0  # pull of T to the identity, in mean squares of a coordinate
 SMOOTHING = 8.0  # of S: C_syn needs its slope, and marked points are a pixel or two off
 KEPT = 0.5  # of what B's flows do not span
@@ -145,16 +146,20 @@ def _side(view: View, pixels: Numbers, weight: F32, kernels: Backend) -> _Side:
     points = np.broadcast_to(at.astype(np.float32), (len(view.flows_b), *at.shape)).copy()
     on_device = kernels.sample(*map(kernels.to_device, (view.flows_b, points)))
     corpus = np.asarray(kernels.to_host(on_device))
-    products = _products(corpus, corpus, weight)
-    directions = principal_mixtures(products, DIRECTIONS)
-    z = _products(queries, corpus, weight) @ directions.T
-    return _Side(queries, corpus, on_device, directions, z, products @ directions.T)
+    learned = np.linspace(0, len(corpus) - 1, min(len(corpus), LEARNED)).round().astype(np.int64)
+    some = corpus[learned]
+    mixtures = principal_mixtures(_products(some, some, weight), DIRECTIONS)
+    directions = np.zeros((len(mixtures), len(corpus)))
+    directions[:, learned] = mixtures
+    v = np.tensordot(mixtures, some, axes=1).astype(np.float32)
+    z, y = _products(queries, v, weight), _products(corpus, v, weight)
+    return _Side(queries, corpus, on_device, directions, z, y)
 
 
 def _products(a: F32, b: F32, weight: F32) -> Floats:
     """Inner products of flows (m, P, 2) and (n, P, 2) under weights (P,), (m, n)."""
-    weighted = (a * weight[:, None]).reshape(len(a), -1)
-    return np.asarray(weighted @ b.reshape(len(b), -1).T, np.float64)
+    weighted = (a * weight[:, None]).reshape(len(a), 2 * len(weight))
+    return np.asarray(weighted @ b.reshape(len(b), 2 * len(weight)).T, np.float64)
 
 
 def principal_mixtures(products: Floats, number: int) -> Floats:

@@ -92,6 +92,24 @@ def test_a_person_who_moves_out_of_proportion_is_calibrated(tiny):
     assert_array_equal(scan(scan.calibrate(wrong))[0].argmin(axis=1), truth)
 
 
+def test_directions_of_many_frames_are_found_from_some_of_them(tiny, monkeypatch):
+    """Flows of four dimensions: those of 20 frames out of 60 span the same."""
+    rng = np.random.default_rng(4)
+    base = smooth_flows(rng, 5, *tiny.views[0].flows_b.shape[1:3])[1:]
+    flows = np.tensordot(rng.standard_normal((60, 4)), base, axes=1).astype(np.float32)
+    views = [replace(v, flows_b=flows) for v in tiny.views]
+    chosen = rng.integers(60, size=COUNT)
+    made = []
+    for learned in (60, 20):
+        monkeypatch.setattr(flow_matching, "LEARNED", learned)
+        scan = FlowScan(tiny.source, views, backend="numpy")
+        calibration = scan.calibrate(chosen)
+        assert (np.abs(calibration.mixture).max(axis=(0, 1)) > 0).sum() == learned
+        made.append(scan(calibration))
+    assert_allclose(made[1], made[0], rtol=1e-3)
+    assert np.abs(made[0] / scan() - 1).max() > 0.1
+
+
 def test_a_mouth_that_never_moves_is_not_calibrated(tiny):
     still = [replace(v, flows_b=np.zeros_like(v.flows_b)) for v in tiny.views]
     scan = FlowScan(tiny.source, still, backend="numpy")
