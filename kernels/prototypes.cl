@@ -14,7 +14,7 @@
 #define WHITE 65535.0f /* the brightest value of a texture */
 
 __kernel void mix_prototypes(
-    __global const float *flows,       /* (frames, 2, H, pitch) [px]; frames: 1 or the mixtures */
+    __global const float *flows,       /* (frames, 2, H, pitch) [px]; mixture b is along b % frames */
     __global const ushort16 *textures, /* (M, H, pitch, 4) of 65535; a weight of 1 */
     __global const float *own,         /* (M, 2, H, pitch) [px] their flows, between 16 numbers */
     __global const float *shares,      /* (M, H, pitch) one over the weight along it; 0 in holes */

@@ -26,7 +26,7 @@ WHITE = wp.constant(65535.0)  # the brightest value of a texture
 
 @wp.kernel
 def mix_prototypes(
-    flows: wp.array[float],  # (frames, 2, H, pitch) [px] of the model; frames: 1 or the mixtures
+    flows: wp.array[float],  # (frames, 2, H, pitch) [px]; mixture b is along b % frames
     textures: wp.array[uvec16],  # (M, H, pitch, 4) of 65535; a weight of 1
     own: wp.array[float],  # (M, 2, H, pitch) [px] flows of the prototypes, between 16 numbers
     shares: wp.array[float],  # (M, H, pitch) one over the weight along it; 0 in holes

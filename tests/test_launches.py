@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
 
 from mmmgpu.backends import get_backend
+from mmmgpu.backends.launches import GPU_WORKERS
 from mmmgpu.backends.planes import planes
 from mmmgpu.errors import InputError
 
@@ -91,6 +92,27 @@ def test_mixtures_whose_flows_are_oriented_together_are_as_alone(backend, mixtur
     for b in range(mixtures):
         alone = mix(k, images, flows, wanted[b : b + 1], weights[b : b + 1], scale)
         assert_array_equal(made[b], alone[0])
+
+
+@pytest.mark.parametrize("mixtures", [1, 2, 5])
+def test_a_gpu_has_a_worker_for_each_prototype_of_a_mixture(backend, mixtures, monkeypatch):
+    k, size = replace(get_backend(backend), workers=GPU_WORKERS), (9, 20)
+    images, flows = prototypes("tearing", size)
+    rng = np.random.default_rng(9)
+    weights, scale = rng.dirichlet(np.ones(NUMBER), mixtures), some_of(size, rng)
+    wanted = rng.normal(0, 1, (mixtures, *size, 2)).astype(np.float32)
+    launch_all, counts = type(k).launch_all, {}
+
+    def counted(self, kernel, count, inputs, outputs):
+        counts[kernel] = count
+        launch_all(self, kernel, count, inputs, outputs)
+
+    monkeypatch.setattr(type(k), "launch_all", counted)
+    made = mix(k, images, flows, wanted, weights, scale)
+    assert counts["prototypes.mix_prototypes"] == NUMBER * mixtures
+    desired = mixed("numpy", images, flows, wanted, weights, scale)
+    assert_allclose(made, desired, rtol=0, atol=1e-4)
+    assert_array_equal(mix(k, images, flows, wanted, weights, scale), made)
 
 
 @pytest.mark.parametrize("kind", ["mirrored", "down", "up and down"])

@@ -61,7 +61,7 @@ class Prototypes:
 
 @dataclass(frozen=True)
 class Launches(ABC):
-    """The operations of `mmmgpu.backends.Backend`, over four things that a runtime can do."""
+    """The operations of `mmmgpu.backends.Backend`, over what a runtime can do."""
 
     workers: int  # accumulators of a forward warp
     # what each thread of the host needed last, so that not every frame allocates it anew
@@ -76,6 +76,10 @@ class Launches(ABC):
     @abstractmethod
     def empty(self, *shape: int, dtype: Any = np.float32) -> Any:
         """An uninitialised device array."""
+
+    @abstractmethod
+    def reshaped(self, array: Any, *shape: int) -> Any:
+        """The same device array with other axes."""
 
     @abstractmethod
     def launcher(
@@ -220,9 +224,24 @@ class Launches(ABC):
         self, held: Prototypes, flow: Any, used: NDArray[np.int64], scale: Any
     ) -> Any:
         alone = [np.arange(len(used) + 1), used, np.ones((len(used), 1))]
-        return self._mixtures(held, flow, 1, len(used), alone, scale)
+        return self._mixtures(held, flow, len(used), alone, scale)
 
     def mix_prototypes(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
+        mixtures, number = weights.shape
+        gpu = self.workers >= GPU_WORKERS
+        # on a CPU a mixture is one worker's, so that bits do not depend on the number of threads
+        shares = min(number, self.workers // max(mixtures, 1)) if gpu else 1
+        if shares <= 1:
+            return self._mix(held, flows, weights, scale)
+        which = np.arange(number) % shares == np.arange(shares)[:, None, None]
+        apart = np.where(which, weights, 0).reshape(-1, number)  # some prototypes a worker
+        mixed = self._mix(held, flows, apart, scale)
+        shape = mixtures, *mixed.shape[1:]
+        ones = self.to_device(np.ones((1, shares), np.float32))
+        whole = self.blend(self.reshaped(mixed, shares, math.prod(shape)), ones)
+        return self.reshaped(whole, *shape)
+
+    def _mix(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
         mixtures, number = weights.shape
         together = next(n for n in TOGETHER if n == 1 or mixtures >= n * self.workers)
         groups = math.ceil(mixtures / together)
@@ -231,18 +250,20 @@ class Launches(ABC):
         used = padded.any(axis=1)
         parts = np.concatenate([[0], np.cumsum(np.count_nonzero(used, axis=1))])
         members = [parts, np.nonzero(used)[1], padded.transpose(0, 2, 1)[used]]
-        return self._mixtures(held, flows, mixtures, mixtures, members, scale)
+        return self._mixtures(held, flows, mixtures, members, scale)
 
     def _mixtures(
         self,
         held: Prototypes,
         flows: Any,
-        frames: int,
         mixtures: int,
         members: list[Any],
         scale: Any,
     ) -> Any:
-        """Run kernels/prototypes with an accumulator for every worker."""
+        """Run kernels/prototypes with an accumulator for every worker.
+
+        Mixture b is along flow b, from the first again after the last.
+        """
         height, pitch, together = held.height, pitch_of(held.width), members[2].shape[1]
         if not mixtures:
             return self.empty(0, 3, height, pitch)
@@ -266,7 +287,7 @@ class Launches(ABC):
             self.empty(mixtures, dtype=np.int32),
         )
         inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
-        inputs += [frames, mixtures, together, height, held.width, size, ring, held.nodes]
+        inputs += [flows.shape[0], mixtures, together, height, held.width, size, ring, held.nodes]
         inputs += [held.hole, workers]
         self.launch_all("prototypes.mix_prototypes", workers, inputs, [*scratch, mixed, arrived])
         check_some_valid(self.to_host(arrived))

@@ -111,6 +111,9 @@ class Warp(Launches):
             use_huge_pages(made.ptr, made.capacity)
         return made
 
+    def reshaped(self, array: Any, *shape: int) -> Any:
+        return array.reshape(shape)
+
     def _allocated(self, allocate: Callable[[], Any]) -> Any:
         def attempt() -> Any:
             with _faults_of(self.device):

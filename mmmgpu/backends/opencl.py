@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
 
@@ -174,6 +174,9 @@ class OpenCL(Launches):
         data = self._allocated(self.memory.allocate, size) if size else None
         return Array(data, shape, kind)
 
+    def reshaped(self, array: Any, *shape: int) -> Any:
+        return replace(array, shape=shape)
+
     def _allocated(self, allocate: Callable[[Any], Any], given: Any) -> Any:
         def attempt() -> Any:
             with _faults_of(self.name):
@@ -199,11 +202,11 @@ class OpenCL(Launches):
         return launch
 
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
-        """The driver has the threads. Wait for it: the memory of an input may be NumPy's."""
+        """The driver has the threads."""
         if count:
             work(0, count)
             with _faults_of(self.name):
-                self.queue.finish()
+                self.memory.release()
 
 
 _launching = threading.Lock()  # a kernel object holds the arguments of one launch
