@@ -56,8 +56,8 @@ def prepare_synthesis(
 
     Args:
         basis: Of a model.
-        shown: Where pictures will be looked at, (h, w); None: everywhere. The rest costs nothing,
-            and is that of the reference prototype.
+        shown: Where pictures will be looked at, (h, w); None: everywhere. The rest is that of the
+            reference prototype; what is outside the rectangle around them costs nothing.
         backend: A name for `mmmgpu.backends.get_backend`.
 
     Raises:

@@ -211,6 +211,22 @@ def test_both_backends_find_the_same(basis, analyzer, backend):
         np.testing.assert_allclose(a, b, atol=2e-3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_fit_of_texture_makes_the_picture_of_the_unfused_reference(basis, backend, seed):
+    """To 1e-4, of flows and pictures that are none of the prototypes'."""
+    rng = np.random.default_rng(seed)
+    alpha, beta = rng.normal(0, 0.3, len(basis.moving)), rng.dirichlet(np.ones(len(basis.images)))
+    image = picture(basis, alpha, beta) + rng.normal(0, 0.02, basis.images[0].shape)
+    made = []
+    for name in ("numpy", backend):
+        analyzer = prepare_analysis(basis, get_backend(name))
+        wanted = planes(image[analyzer.inside].astype(np.float32))
+        every = np.arange(len(basis.images))
+        got = fit_texture(analyzer, wanted, analyzer.basis.flow(alpha), every)[0]
+        made.append(picture(basis, alpha, got))
+    np.testing.assert_allclose(made[1], made[0], rtol=0, atol=1e-4)
+
+
 def test_no_moved_prototypes_are_brought_to_the_host(basis, backend, monkeypatch):
     """Only what is solved for beta, and the one picture that a step looks at."""
     kernels = get_backend(backend)

@@ -82,7 +82,8 @@ class Backend(Protocol):
     def mix_prototypes(self, held: Any, flows: Any, weights: F32, scale: Any, /) -> Any:
         """CE05, Eq. 2, scaled: (B, 2, H, P), NumPy (B, M), (H, P) -> (B, 3, H, P).
 
-        A prototype costs nothing where its weight is 0; else as `move_prototypes`.
+        A prototype without weight costs nothing; where some of up to four mixtures that go together
+        have none, it is re-oriented for these too. Else as `move_prototypes`.
         """
 
     def piecewise_warp(
