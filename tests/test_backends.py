@@ -271,16 +271,6 @@ warp.config.kernel_cache_dir = sys.argv[2]
 """
 
 
-@pytest.mark.parametrize("pattern", ["*.o", "*.meta"])
-def test_a_damaged_warp_cache_is_rebuilt(tmp_path, pattern):
-    whole = run(WARP_CACHE + ONE_OPERATION, "warp", tmp_path)
-    damaged = list(tmp_path.rglob(pattern))
-    assert damaged
-    for path in damaged:
-        path.write_bytes(b"\xff" * 50)
-    assert run(WARP_CACHE + ONE_OPERATION, "warp", tmp_path) == whole
-
-
 def test_a_damaged_pocl_cache_is_not_read(tmp_path):
     whole = run(ONE_OPERATION, "opencl", POCL_CACHE_DIR=str(tmp_path), POCL_KERNEL_CACHE="1")
     damaged = list(tmp_path.rglob("*.so"))

@@ -8,13 +8,11 @@ import functools
 import importlib
 import itertools
 import os
-import shutil
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -25,6 +23,7 @@ from mmmgpu.arrays import F32
 from mmmgpu.backends.faults import device_failed, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
 from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
+from mmmgpu.backends.warp_cache import load, own_folder
 from mmmgpu.errors import InputError
 
 NO_MEMORY = "Failed to allocate"  # what Warp says
@@ -61,11 +60,19 @@ def _start() -> None:
     kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nothing, 2)
-        cast(Any, wp).init()
+        _initialise()
     finally:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nothing)
+
+
+def _initialise() -> None:
+    try:
+        cast(Any, wp).init()
+    except OSError:  # there can be no cache in its place, as where the home is read-only
+        wp.config.kernel_cache_dir = own_folder()
+        cast(Any, wp).init()
 
 
 @contextmanager
@@ -153,23 +160,12 @@ def _kernel(kernel: str, device: str) -> tuple[Any, list[Any]]:
     stem, _, name = kernel.partition(".")
     compiled = getattr(importlib.import_module(f"mmmgpu.kernels.{stem}"), name)
     with _compiling:
-        _load(compiled.module, device).get_kernel_hooks(compiled)
+        loaded = load(compiled.module, wp.get_device(device), _block(device))
+        loaded.get_kernel_hooks(compiled)
     return compiled, [argument.type for argument in compiled.adj.args]
 
 
 _compiling = threading.Lock()
-
-
-def _load(module: Any, device: str) -> Any:
-    """A kernel module, compiled or from Warp's cache; a damaged cache entry is rebuilt."""
-    target = wp.get_device(device)
-    block = _block(device)
-    try:
-        return module.load(target, block)
-    except Exception:  # Warp raises whatever its parsers do
-        entry = Path(wp.config.kernel_cache_dir or "", module.get_module_identifier(block))
-        shutil.rmtree(entry, ignore_errors=True)
-        return module.load(target, block)
 
 
 def _block(device: str) -> int:
