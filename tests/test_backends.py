@@ -77,6 +77,21 @@ def test_an_unknown_device_is_an_error_that_names_it(name):
         get_backend(f"{name}:no:such")
 
 
+@pytest.mark.parametrize("device", ["cuda", "cuda:0"])
+def test_a_cuda_device_where_there_is_none_is_an_error_that_lists_those_present(device):
+    program = """
+import sys
+from mmmgpu.backends import get_backend
+from mmmgpu.errors import InputError
+try:
+    get_backend(sys.argv[1])
+except InputError as error:
+    print(error)
+"""
+    said = run(program, f"warp:{device}", CUDA_VISIBLE_DEVICES="")
+    assert said == f"there is no device 'warp:{device}'; present: warp:cpu\n"
+
+
 @pytest.mark.parametrize(("name", "explicit"), [("warp", "warp:cpu"), ("opencl", "opencl:0:0")])
 def test_a_device_may_be_named(name, explicit):
     k = get_backend(explicit)

@@ -36,7 +36,7 @@ def open_backend(device: str, threads: int) -> "Warp":
     _start()
     try:
         found = wp.get_device(device or "cpu")
-    except ValueError:
+    except (ValueError, RuntimeError):  # RuntimeError: "cuda" where there is none
         present = ", ".join(f"warp:{d.alias}" for d in wp.get_devices())
         raise InputError(f"there is no device 'warp:{device}'; present: {present}") from None
     if found.is_cpu:
