@@ -44,6 +44,12 @@ def backend(request):
 
 
 @pytest.fixture(scope="session")
+def family(backend):
+    """The name of that backend without its device: a key of `BACKENDS`."""
+    return backend.partition(":")[0]
+
+
+@pytest.fixture(scope="session")
 def world(tmp_path_factory):
     """A drawn person in a few short clips with sound and alignments; see `worlds`."""
     return make_world(tmp_path_factory.mktemp("world"))

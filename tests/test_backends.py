@@ -295,8 +295,8 @@ def test_a_damaged_pocl_cache_is_not_read(tmp_path):
     assert run(ONE_OPERATION, "opencl", POCL_CACHE_DIR=str(tmp_path)) == whole
 
 
-def test_first_use_by_four_processes_at_once_with_an_empty_cache(backend, tmp_path):
-    setup = WARP_CACHE if backend == "warp" else ""
+def test_first_use_by_four_processes_at_once_with_an_empty_cache(backend, family, tmp_path):
+    setup = WARP_CACHE if family == "warp" else ""
     with ThreadPoolExecutor(4) as pool:
         place = {"XDG_CACHE_HOME": str(tmp_path)}
         program = setup + ONE_OPERATION

@@ -99,14 +99,14 @@ def test_a_cuda_device_that_disappears_is_one_line(monkeypatch, function):
     assert isinstance(raised.value, InputError)  # so that commands end with this line
 
 
-def test_an_array_that_is_too_large_for_the_device_is_said(backend):
-    with pytest.raises(DeviceMemoryError, match=rf"^{backend}:\S+: not enough memory \("):
+def test_an_array_that_is_too_large_for_the_device_is_said(backend, family):
+    with pytest.raises(DeviceMemoryError, match=rf"^{family}:\S+: not enough memory \("):
         get_backend(backend).empty(1 << 30, 1 << 14)
 
 
-def limit_memory(monkeypatch, backend, most):
+def limit_memory(monkeypatch, family, most):
     """Let that device hold arrays of at most `most` items each; returns the sizes asked for."""
-    runtime = {"opencl": opencl.OpenCL, "warp": nvwarp.Warp}[backend]
+    runtime = {"opencl": opencl.OpenCL, "warp": nvwarp.Warp}[family]
     asked, real = [], (runtime.empty, runtime.to_device)
 
     def check(size):
@@ -158,34 +158,34 @@ MANY = {  # what is long along the axis that can be cut
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_what_does_not_fit_is_done_in_parts(monkeypatch, backend, name):
-    asked = limit_memory(monkeypatch, backend, np.inf)
+def test_what_does_not_fit_is_done_in_parts(monkeypatch, backend, family, name):
+    asked = limit_memory(monkeypatch, family, np.inf)
     whole = call(name, backend, **MANY[name])
     most = max(asked) - 1
-    asked = limit_memory(monkeypatch, backend, most)
+    asked = limit_memory(monkeypatch, family, most)
     parts = call(name, backend, **MANY[name])
     assert max(asked) > most  # it was tried
     assert_array_equal(first(parts), first(whole))
 
 
-def test_frames_that_do_not_fit_are_made_by_several_launches(monkeypatch, backend, basis):
+def test_frames_that_do_not_fit_are_made_by_several_launches(monkeypatch, backend, family, basis):
     """As many as fit, however much was kept for more of them."""
     given = np.zeros((9, 4)), RNG.dirichlet(np.ones(5), 9)
-    asked = limit_memory(monkeypatch, backend, np.inf)
+    asked = limit_memory(monkeypatch, family, np.inf)
     synthesizer = prepare_synthesis(basis, backend=backend)
     asked.clear()
     whole = synthesize_batch(synthesizer, *given)
     most = max(asked) // 2
-    asked = limit_memory(monkeypatch, backend, most)
+    asked = limit_memory(monkeypatch, family, most)
     parts = synthesize_batch(synthesizer, *given)
     assert max(asked) > most  # it was tried
     assert_array_equal(parts, whole)
-    limit_memory(monkeypatch, backend, 4)
+    limit_memory(monkeypatch, family, 4)
     with pytest.raises(DeviceMemoryError, match="not enough memory"):
         synthesize_batch(synthesizer, *given)
 
 
-def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, basis):
+def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, family, basis):
     """Before anything is said to be too large: also what has nothing to do with it."""
     synthesizer = prepare_synthesis(basis, backend=backend)
     synthesize_batch(synthesizer, np.zeros((9, 4)), np.full((9, 5), 0.2))
@@ -193,7 +193,7 @@ def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, basis):
     home, name, error = {
         "opencl": (cl, "Buffer", driver_error("MEM_OBJECT_ALLOCATION_FAILURE")),
         "warp": (wp, "empty", RuntimeError("Failed to allocate 9 bytes on device 'cpu'")),
-    }[backend]
+    }[family]
     allocate = getattr(home, name)
 
     def allocated(*given, **options):
@@ -208,7 +208,7 @@ def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, basis):
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_one_item_that_does_not_fit_is_an_error(monkeypatch, backend, name):
-    limit_memory(monkeypatch, backend, 1)
+def test_one_item_that_does_not_fit_is_an_error(monkeypatch, backend, family, name):
+    limit_memory(monkeypatch, family, 1)
     with pytest.raises(DeviceMemoryError, match="not enough memory"):
         call(name, backend, **MANY[name])
