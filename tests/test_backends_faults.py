@@ -1,5 +1,6 @@
 """Drivers and devices that fail: one clear line, or less at a time."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -55,6 +56,29 @@ def test_a_kernel_that_cannot_be_built_is_one_line_with_the_driver_s_reason(monk
     assert "\n" not in str(raised.value)
 
 
+FAILED = [
+    Exception("CPU kernel build failed with error code 1"),
+    Exception("Failed to load CUDA module 'blend'\n(device='cuda:0')"),
+    OSError("No space left on device"),
+]
+
+
+@pytest.mark.parametrize("error", FAILED)
+def test_a_kernel_that_warp_cannot_build_or_load_is_one_line(monkeypatch, error):
+    nvwarp._kernel.cache_clear()
+    monkeypatch.setattr(nvwarp, "load", raising(error))
+    said = re.escape(" ".join(str(error).split()))
+    with pytest.raises(DeviceError, match=rf"^warp:cpu: cannot build blend\.py \({said}\); choose"):
+        call("blend", "warp")
+
+
+def test_a_kernel_of_ours_that_is_wrong_is_a_defect(monkeypatch):
+    nvwarp._kernel.cache_clear()
+    monkeypatch.setattr(nvwarp, "load", raising(wp.WarpCodegenError("no such function")))
+    with pytest.raises(wp.WarpCodegenError, match="no such function"):
+        call("blend", "warp")
+
+
 @pytest.mark.parametrize("code", sorted(opencl.NO_MEMORY | opencl.GONE))
 def test_a_failure_of_the_driver_names_the_device(monkeypatch, code):
     k = get_backend("opencl:0:0")
@@ -64,6 +88,22 @@ def test_a_failure_of_the_driver_names_the_device(monkeypatch, code):
     kind = DeviceMemoryError if code in opencl.NO_MEMORY else DeviceError
     with pytest.raises(kind, match=rf"^opencl:0:0: .*{name}.* another (device )?with --backend$"):
         k.to_host(array)
+
+
+def test_what_may_be_either_is_called_so_and_tried_with_less(monkeypatch):
+    k = get_backend("opencl:0:0")
+    array = k.empty(1, 2, 2, 1)
+    monkeypatch.setattr(cl, "enqueue_map_buffer", raising(driver_error("OUT_OF_RESOURCES")))
+    said = r"^opencl:0:0: not enough memory, or the device failed \(.*OUT_OF_RESOURCES"
+    with pytest.raises(DeviceMemoryError, match=said):
+        k.to_host(array)
+
+
+@pytest.mark.parametrize("function", ["Context", "CommandQueue"])
+def test_a_device_that_cannot_be_opened_is_one_line(monkeypatch, function):
+    monkeypatch.setattr(cl, function, raising(driver_error("DEVICE_NOT_AVAILABLE")))
+    with pytest.raises(DeviceError, match=r"^opencl:0:0: the device failed \(.*NOT_AVAILABLE"):
+        opencl.open_backend("0:0", 1)
 
 
 def test_a_defect_of_ours_is_not_blamed_on_the_driver(monkeypatch):

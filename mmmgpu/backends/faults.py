@@ -11,6 +11,14 @@ def out_of_memory(device: str, error: Exception) -> DeviceMemoryError:
     )
 
 
+def out_of_resources(device: str, error: Exception) -> DeviceMemoryError:
+    """`device` has not enough memory, or has failed: its driver says the same of both."""
+    return DeviceMemoryError(
+        f"{device}: not enough memory, or the device failed ({_said(error)}); give smaller "
+        "pictures, run the same again, or choose another device with --backend"
+    )
+
+
 def device_failed(device: str, error: Exception) -> DeviceError:
     """`device`, a name for `get_backend`, has failed or is no longer there."""
     return DeviceError(
@@ -19,6 +27,14 @@ def device_failed(device: str, error: Exception) -> DeviceError:
     )
 
 
-def _said(error: Exception) -> str:
+def not_built(device: str, source: str, error: Exception | str) -> DeviceError:
+    """What compiles for `device`, or loads what is compiled, has failed at the file `source`."""
+    return DeviceError(
+        f"{device}: cannot build {source} ({_said(error)}); choose another device with --backend: "
+        "mmmgpu info lists those present"
+    )
+
+
+def _said(error: Exception | str) -> str:
     """The driver's own words, in one line."""
     return " ".join(str(error).split())

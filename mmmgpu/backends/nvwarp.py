@@ -20,7 +20,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
-from mmmgpu.backends.faults import device_failed, out_of_memory
+from mmmgpu.backends.faults import device_failed, not_built, out_of_memory
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
 from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
 from mmmgpu.backends.warp_cache import load, own_folder
@@ -28,6 +28,7 @@ from mmmgpu.errors import InputError
 
 NO_MEMORY = "Failed to allocate"  # what Warp says
 GONE = "CUDA error", "Failed to synchronize"
+UNBUILT = "kernel build failed", "Failed to load"
 POOLED = 0.5  # of a CUDA device's memory: so much, in use or free, is not given back
 
 
@@ -90,6 +91,22 @@ def _faults_of(device: str) -> Iterator[None]:
             raise out_of_memory(f"warp:{device}", error) from error
         if any(words in str(error) for words in GONE):
             raise device_failed(f"warp:{device}", error) from error
+        raise
+
+
+@contextmanager
+def _failed_builds(stem: str, device: str) -> Iterator[None]:
+    """Say in one line why a kernel module cannot be compiled or loaded.
+
+    Raises:
+        DeviceError: In place of what a compiler, a loader or the disk said; what Warp says of our
+            code passes as it is.
+    """
+    try:
+        yield
+    except Exception as error:  # Warp has no class for these
+        if isinstance(error, OSError) or any(words in str(error) for words in UNBUILT):
+            raise not_built(f"warp:{device}", f"{stem}.py", error) from error
         raise
 
 
@@ -159,7 +176,7 @@ def _kernel(kernel: str, device: str) -> tuple[Any, list[Any]]:
     """The Warp kernel ``stem.name``, ready on `device`, and the declared types of its arguments."""
     stem, _, name = kernel.partition(".")
     compiled = getattr(importlib.import_module(f"mmmgpu.kernels.{stem}"), name)
-    with _compiling:
+    with _compiling, _faults_of(device), _failed_builds(stem, device):
         loaded = load(compiled.module, wp.get_device(device), _block(device))
         loaded.get_kernel_hooks(compiled)
     return compiled, [argument.type for argument in compiled.adj.args]

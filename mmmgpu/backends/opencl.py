@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
 from mmmgpu.backends import default_threads
-from mmmgpu.backends.faults import device_failed, out_of_memory
+from mmmgpu.backends.faults import device_failed, not_built, out_of_memory, out_of_resources
 from mmmgpu.backends.launches import GPU_WORKERS, Launches
 from mmmgpu.backends.memory import keep_freed_memory
 from mmmgpu.backends.opencl_memory import Array, OwnMemory, SharedMemory
 from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
-from mmmgpu.errors import DeviceError, InputError
+from mmmgpu.errors import InputError
 
 LOCAL = 16  # work-items of a group; 1 where there are fewer than `GROUPS` for each thread
 GROUPS = 32
@@ -41,7 +41,6 @@ NO_MEMORY = {
     cl.status_code.MAP_FAILURE,
     cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
     cl.status_code.OUT_OF_HOST_MEMORY,
-    cl.status_code.OUT_OF_RESOURCES,
     cl.status_code.INVALID_BUFFER_SIZE,
 }
 GONE = {
@@ -66,11 +65,13 @@ def open_backend(device: str, threads: int) -> "OpenCL":
     found = present[chosen]
     if not found.double_fp_config:
         raise InputError(f"device 'opencl:{chosen}' has no float64; choose another")
-    queue = cl.CommandQueue(cl.Context([found]))
+    name = f"opencl:{chosen}"
+    with _faults_of(name):
+        queue = cl.CommandQueue(cl.Context([found]))
     if not found.type & cl.device_type.CPU:
-        return OpenCL(GPU_WORKERS, f"opencl:{chosen}", queue, OwnMemory(queue))
+        return OpenCL(GPU_WORKERS, name, queue, OwnMemory(queue))
     keep_freed_memory()
-    return OpenCL(found.max_compute_units, f"opencl:{chosen}", queue, SharedMemory(queue))
+    return OpenCL(found.max_compute_units, name, queue, SharedMemory(queue))
 
 
 def list_devices() -> dict[str, str]:
@@ -144,6 +145,8 @@ def _faults_of(device: str) -> Iterator[None]:
     except cl.Error as error:
         if error.code in NO_MEMORY:
             raise out_of_memory(device, error) from error
+        if error.code == cl.status_code.OUT_OF_RESOURCES:
+            raise out_of_resources(device, error) from error
         if error.code in GONE:
             raise device_failed(device, error) from error
         raise
@@ -232,11 +235,8 @@ def _program(context: Any, stem: str) -> Any:
         return program.build(cache_dir=False)  # nor pyopencl's cache: it has stale locks
     except cl.RuntimeError as error:
         lines = [line for line in str(error).splitlines() if "error" in line.lower()]
-        said = " ".join((lines or str(error).splitlines())[0].split())
-        raise DeviceError(
-            f"{context.devices[0].name}: its driver cannot build {stem}.cl ({said}); choose "
-            "another device with --backend: mmmgpu info lists those present"
-        ) from error
+        said = (lines or str(error).splitlines())[0]
+        raise not_built(context.devices[0].name, f"{stem}.cl", said) from error
 
 
 def _included(line: re.Match[str]) -> str:
