@@ -1,6 +1,10 @@
 """Drivers and devices that fail: one clear line, or less at a time."""
 
+import gc
 import re
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +15,7 @@ from numpy.testing import assert_array_equal
 from test_operations import CALLS, call, first
 
 from mmmgpu.backends import get_backend, nvwarp, opencl
+from mmmgpu.backends.planes import picture
 from mmmgpu.errors import DeviceError, DeviceMemoryError, InputError
 from mmmgpu.synthesis import prepare_synthesis, synthesize_batch
 
@@ -225,11 +230,8 @@ def test_frames_that_do_not_fit_are_made_by_several_launches(monkeypatch, backen
         synthesize_batch(synthesizer, *given)
 
 
-def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, family, basis):
-    """Before anything is said to be too large: also what has nothing to do with it."""
-    synthesizer = prepare_synthesis(basis, backend=backend)
-    synthesize_batch(synthesizer, np.zeros((9, 4)), np.full((9, 5), 0.2))
-    k = synthesizer.kernels
+def refuse_memory(monkeypatch, family, is_short):
+    """Let the driver have no memory as long as `is_short()`."""
     home, name, error = {
         "opencl": (cl, "Buffer", driver_error("MEM_OBJECT_ALLOCATION_FAILURE")),
         "warp": (wp, "empty", RuntimeError("Failed to allocate 9 bytes on device 'cpu'")),
@@ -237,14 +239,60 @@ def test_scratch_is_given_up_where_memory_is_short(monkeypatch, backend, family,
     allocate = getattr(home, name)
 
     def allocated(*given, **options):
-        if vars(k.scratch):
+        if is_short():
             raise error
         return allocate(*given, **options)
 
     monkeypatch.setattr(home, name, allocated)
-    assert vars(k.scratch)
-    assert k.empty(3, 4).shape == (3, 4)
-    assert not vars(k.scratch)
+
+
+@pytest.fixture
+def synthesizer(backend, basis):
+    """With a backend of its own, whose scratch is that of this test alone."""
+    made = prepare_synthesis(basis, backend=backend)
+    return replace(made, kernels=replace(made.kernels))
+
+
+def some_frames(synthesizer):
+    return synthesize_batch(synthesizer, np.zeros((9, 4)), np.full((9, 5), 0.2))
+
+
+def kept_by_this_thread(k):
+    """Whether it is there, for how long: the scratch itself, not where it was kept."""
+    first = weakref.ref(k.scratch.of_this_thread().arrays[2][0])
+    assert first() is not None
+    return lambda: first() is not None
+
+
+def test_scratch_is_given_up_where_memory_is_short(monkeypatch, family, synthesizer):
+    """Before anything is said to be too large, be it of a thread that does nothing at present."""
+    k = synthesizer.kernels
+    with ThreadPoolExecutor(1) as other:
+        other.submit(some_frames, synthesizer).result()
+        some_frames(synthesizer)
+        kept = kept_by_this_thread(k), other.submit(kept_by_this_thread, k).result()
+        refuse_memory(monkeypatch, family, lambda: any(is_there() for is_there in kept))
+        assert k.empty(3, 4).shape == (3, 4)
+
+
+def test_scratch_is_given_up_for_the_pictures_it_is_needed_for(monkeypatch, family, synthesizer):
+    whole = some_frames(synthesizer)
+    s, k = synthesizer, synthesizer.kernels
+    flows = k.blend(s.flows, k.to_device(np.zeros((9, 4), np.float32)))
+    refuse_memory(monkeypatch, family, kept_by_this_thread(k))
+    weights = np.full((9, 5), 0.2, np.float32)
+    mixed = k.to_host(k.mix_prototypes(s.held, flows, weights, s.scale))
+    width = whole.shape[2]
+    assert_array_equal(np.minimum([picture(one, width) for one in mixed], 1), whole)
+
+
+def test_scratch_goes_with_its_thread(synthesizer):
+    with ThreadPoolExecutor(1) as other:
+        other.submit(some_frames, synthesizer).result()
+        is_there = other.submit(kept_by_this_thread, synthesizer.kernels).result()
+        assert is_there()
+    gc.collect()
+    assert not is_there()
 
 
 @pytest.mark.parametrize("name", CALLS)

@@ -6,7 +6,6 @@ A runtime (Warp, OpenCL) is a subclass that knows how to hold arrays and how to 
 import functools
 import itertools
 import math
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32, check_some_valid
 from mmmgpu.backends.orientation import orient
 from mmmgpu.backends.planes import LANES, pitch_of
+from mmmgpu.backends.scratch import Scratch
 from mmmgpu.errors import DeviceMemoryError
 
 GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a thread
@@ -64,8 +64,8 @@ class Launches(ABC):
     """The operations of `mmmgpu.backends.Backend`, over what a runtime can do."""
 
     workers: int  # accumulators of a forward warp
-    # what each thread of the host needed last, so that not every frame allocates it anew
-    scratch: threading.local = field(init=False, default_factory=threading.local, compare=False)
+    # so that not every frame allocates it anew
+    scratch: Scratch = field(init=False, default_factory=Scratch, compare=False)
 
     @abstractmethod
     def to_device(self, array: NDArray[Any]) -> Any: ...
@@ -95,13 +95,12 @@ class Launches(ABC):
         """Call `work(first, n)` for contiguous parts of `count` items, on all threads."""
 
     def within_memory(self, allocate: Callable[[], Any]) -> Any:
-        """What `allocate()` gives; where memory is short, this thread's scratch goes first."""
+        """What `allocate()` gives; where memory is short, the scratch of all threads goes first."""
         try:
             return allocate()
         except DeviceMemoryError:
-            if not self.scratch.__dict__:
+            if not self.scratch.give_up():
                 raise
-            self.scratch.__dict__.clear()
         return allocate()
 
     def launch(
@@ -281,7 +280,6 @@ class Launches(ABC):
             ((7, pitch), np.float32),
             ((height, pitch), np.int32),
         ]
-        scratch = self._scratch(workers, shapes)
         mixed, arrived = (
             self.empty(mixtures, 3, height, pitch),
             self.empty(mixtures, dtype=np.int32),
@@ -289,19 +287,22 @@ class Launches(ABC):
         inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
         inputs += [flows.shape[0], mixtures, together, height, held.width, size, ring, held.nodes]
         inputs += [held.hole, workers]
+        scratch = self._scratch(
+            workers, shapes
+        )  # last: until here, all that is kept can be given up
         self.launch_all("prototypes.mix_prototypes", workers, inputs, [*scratch, mixed, arrived])
         check_some_valid(self.to_host(arrived))
         return mixed
 
     def _scratch(self, workers: int, shapes: list[Any]) -> list[Any]:
         """Arrays (workers or more, *shape), of this thread alone."""
-        kept = self.scratch.__dict__
-        if kept.get("shapes") != shapes or kept["workers"] < workers:
-            kept.clear()  # before more is asked for
-            kept["arrays"] = [self.empty(workers, *s, dtype=dtype) for s, dtype in shapes]
-            kept |= {"shapes": shapes, "workers": workers}
-        arrays: list[Any] = kept["arrays"]
-        return arrays
+        kept = self.scratch.of_this_thread()
+        found = kept.arrays
+        if found is None or found[0] < workers or found[1] != shapes:
+            found = kept.arrays = None  # before more is asked for
+            arrays = [self.empty(workers, *s, dtype=dtype) for s, dtype in shapes]
+            found = kept.arrays = workers, shapes, arrays
+        return found[2]
 
     def piecewise_warp(
         self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any
