@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.analysis import solve_simplex
-from mmmgpu.backends import get_backend
+from mmmgpu.backends import Backend, get_backend
 from mmmgpu.backends.planes import picture, planes
 from mmmgpu.basis import MOUTH, Basis
 from mmmgpu.batches import in_parts
+from mmmgpu.errors import DeviceMemoryError
 from mmmgpu.flow_matching import FlowScan, View, distances, synthetic_flows
 from mmmgpu.synthesis import HOLE, NO_TEXTURE
 
@@ -167,20 +168,33 @@ def texture_coordinates(
     source: Basis, views: Sequence[View], view: Numbers, *, backend: str = "warp"
 ) -> Floats:
     """Eq. 8: beta_{i,k} of prototype k of A in the other prototypes, column k, (M, M)."""
-    kernels = get_backend(backend)
+    kernels, beta = get_backend(backend), np.zeros((len(view), len(view)))
     root = np.where(source.w_t > MOUTH, np.sqrt(source.w_t), 0).astype(np.float32)[..., None]
-    scale = kernels.to_device(planes(root)[0])
-    wanted = planes(source.images * root)
-    every, beta = np.arange(len(view)), np.zeros((len(view), len(view)))
     for r, v in enumerate(views):
         mine = np.flatnonzero(view == r)
-        held = kernels.hold_prototypes(source.images, v.flows_a, HOLE) if len(mine) else None
-        for k in mine:
-            others = every[every != k]
-            flow, image = map(kernels.to_device, (planes(v.flows_a[k : k + 1]), wanted[k]))
-            moved = kernels.move_prototypes(held, flow, others, scale)
-            products = kernels.to_host(kernels.normal_equations(moved, image))
-            beta[others, k] = solve_simplex(products[:-1], products[-1])
+        if len(mine):
+            beta[:, mine] = _columns(source.images, v.flows_a, root, mine, kernels)
+    return beta
+
+
+def _columns(images: F32, flows: F32, root: F32, mine: Numbers, kernels: Backend) -> Floats:
+    """Columns `mine` (K,) of beta, (M, K), all of one view; nothing stays on the device.
+
+    root: sqrt(w_t), (h, w, 1).
+    """
+    held = kernels.hold_prototypes(images, flows, HOLE)
+    scale, wanted = kernels.to_device(planes(root)[0]), planes(images * root)
+    every, beta = np.arange(len(images)), np.zeros((len(images), len(mine)))
+
+    def products(k: int, others: Numbers) -> F32:
+        flow, image = map(kernels.to_device, (planes(flows[k : k + 1]), wanted[k]))
+        moved = kernels.move_prototypes(held, flow, others, scale)
+        return kernels.to_host(kernels.normal_equations(moved, image))
+
+    for column, k in enumerate(mine):
+        others = every[every != k]
+        found = products(k, others)
+        beta[others, column] = solve_simplex(found[:-1], found[-1])
     return beta
 
 
@@ -226,16 +240,40 @@ class _TextureScan:
 
         A frame that is the candidate of several prototypes is warped once.
         """
-        flows = self._flows[mine]
+        flows, width = self._flows[mine], self._target.w_t.shape[1]
         weights = np.zeros((len(mine), len(self._target.images)), np.float32)
         np.add.at(weights.T, candidates, self._beta[:, mine])
-        made = np.zeros((len(mine), 3, *flows.shape[2:]), np.float32)
-        for frames, held in self._hold(r, np.flatnonzero(weights.any(axis=0))):
+        frames = np.flatnonzero(weights.any(axis=0))
+        made = self._sum_of_held(r, frames, flows, weights)
+        if made is None:
+            made = self._sum_in_parts(r, frames, flows, weights)
+        return np.stack([self._seen(picture(one, width)) for one in made])
+
+    def _sum_of_held(self, r: int, frames: Numbers, flows: F32, weights: F32) -> F32 | None:
+        """Mixtures (K, 3, h', pitch) of `frames`; None, and nothing is held, if memory is short."""
+        try:
+            return self._sum(self._hold(r, frames), flows, weights)
+        except DeviceMemoryError:
+            self._held = [[] for _ in self._views]
+            return None
+
+    def _sum_in_parts(self, r: int, frames: Numbers, flows: F32, weights: F32) -> F32:
+        """The same of as many frames at a time as memory allows, none of which is kept."""
+
+        def summed(part: slice) -> F32:
+            return self._sum([self._prototypes(r, frames[part])], flows, weights)
+
+        made: F32 = np.sum(in_parts(summed, len(frames)), axis=0)
+        return made
+
+    def _sum(self, parts: list[tuple[Numbers, Any]], flows: F32, weights: F32) -> F32:
+        """Mixtures (K, 3, h', pitch) of all that is held in `parts`."""
+        made = np.zeros((len(flows), 3, *flows.shape[2:]), np.float32)
+        for frames, held in parts:
             shares = weights[:, frames]
             some = np.flatnonzero(shares.any(axis=1))
             made[some] += self._mixed(held, flows[some], shares[some])
-        width = self._target.w_t.shape[1]
-        return np.stack([self._seen(picture(one, width)) for one in made])
+        return made
 
     def _mixed(self, held: Any, flows: F32, shares: F32) -> F32:
         """Mixtures (K, 3, h', pitch) of what is held; in parts if need be."""
@@ -254,6 +292,10 @@ class _TextureScan:
         parts = self._held[r]
         new = np.setdiff1d(frames, np.concatenate([frames[:0], *(part for part, _ in parts)]))
         if len(new):
-            given = self._target.images[new], self._views[r].flows_b[new]
-            parts.append((new, self._kernels.hold_prototypes(*given, HOLE)))
+            parts.append(self._prototypes(r, new))
         return parts
+
+    def _prototypes(self, r: int, frames: Numbers) -> tuple[Numbers, Any]:
+        """Frames and what is on the device of them, with their flows in view r."""
+        given = self._target.images[frames], self._views[r].flows_b[frames]
+        return frames, self._kernels.hold_prototypes(*given, HOLE)

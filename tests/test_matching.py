@@ -1,5 +1,6 @@
 """Matching by synthesis against slow versions, small worlds made to measure, and known truth."""
 
+import weakref
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -78,6 +79,49 @@ def test_scans_of_what_does_not_fit_are_made_in_parts(tiny, backend, monkeypatch
     for scan, desired in zip(scans, whole, strict=True):
         assert_array_equal(scan(), desired)
     assert refused
+
+
+@pytest.fixture
+def device(backend, monkeypatch):
+    """A device that holds at most `most` prototypes in all; `refused` counts what it did not."""
+    found = SimpleNamespace(most=99, refused=0, held=[])
+    runtime = type(get_backend(backend))
+    real = runtime.hold_prototypes
+
+    def hold(self, images, flows, hole):
+        if len(images) + sum(n for n, one in found.held if one() is not None) > found.most:
+            found.refused += 1
+            raise DeviceMemoryError("not enough memory")
+        held = real(self, images, flows, hole)
+        found.held.append((len(images), weakref.ref(held)))
+        return held
+
+    monkeypatch.setattr(runtime, "hold_prototypes", hold)
+    return found
+
+
+def test_candidates_that_do_not_fit_together_are_held_one_after_the_other(tiny, backend, device):
+    beta = np.random.default_rng(1).dirichlet(np.ones(COUNT), COUNT).T
+    candidates = [np.array(c) for c in ([5] * 5, [3, 2, 2, 2, 4], [3, 1, 2, 6, 0])]
+    scan = scan_of(tiny, beta, backend)
+    wanted = [scan(c) for c in candidates]
+    del scan
+    for most in (4, 1):
+        device.most, device.refused = most, 0
+        scan = scan_of(tiny, beta, backend)
+        for c, desired in zip(candidates, wanted, strict=True):
+            assert_allclose(scan(c), desired, rtol=1e-5)
+        assert device.refused
+    device.most = 0
+    with pytest.raises(DeviceMemoryError, match="not enough memory"):
+        scan(candidates[0])
+
+
+def test_texture_coordinates_hold_the_prototypes_once_at_a_time(tiny, backend, device):
+    wanted = texture_coordinates(tiny.source, tiny.views, tiny.view, backend=backend)
+    device.most = COUNT
+    again = texture_coordinates(tiny.source, tiny.views, tiny.view, backend=backend)
+    assert_array_equal(again, wanted)
 
 
 @pytest.mark.parametrize("equal", [False, True])
