@@ -280,16 +280,13 @@ class Launches(ABC):
             ((7, pitch), np.float32),
             ((height, pitch), np.int32),
         ]
-        mixed, arrived = (
-            self.empty(mixtures, 3, height, pitch),
-            self.empty(mixtures, dtype=np.int32),
-        )
+        mixed = self.empty(mixtures, 3, height, pitch)
+        arrived = self.empty(mixtures, dtype=np.int32)
         inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
         inputs += [flows.shape[0], mixtures, together, height, held.width, size, ring, held.nodes]
         inputs += [held.hole, workers]
-        scratch = self._scratch(
-            workers, shapes
-        )  # last: until here, all that is kept can be given up
+        # last: until here, all that is kept can be given up
+        scratch = self._scratch(workers, shapes)
         self.launch_all("prototypes.mix_prototypes", workers, inputs, [*scratch, mixed, arrived])
         check_some_valid(self.to_host(arrived))
         return mixed
