@@ -253,17 +253,16 @@ def show(
 ):
     """Add the means of row `y` to a picture that is `begun`, or begin it; begin the pyramid.
 
-    Their sums are emptied. Pixels that are asked for and received too little go to the list of
-    holes, of which there are `found`. Returns how many there are then.
+    Empties their sums. Pixels that are asked for and received too little go to the list of holes,
+    of which there are `found`. Returns how many there are then.
     """
     area = h * pitch
     across = pitch_of((w + 1) / 2)
     step = (h + 1) / 2 * across
     number = int(found)
     if begun == 0:
-        for x in range(0, pitch, LANES):
-            for plane in range(3):
-                put(out, start + plane * area + y * pitch + x, vec16())
+        for i in range(0, 3 * pitch, LANES):
+            put(out, start + i / pitch * area + y * pitch + i % pitch, vec16())
     for x in range(0, pitch, LANES):
         t = here + COLOUR * (x + LEFT)
         a = get(total, t)
@@ -349,19 +348,15 @@ def carry(
     out: wp.array[float],
     start: int,
 ):
-    """Add a prototype, carried along a flow, to a picture that is `begun`, or begin it.
-
-    Returns 0 where nothing arrives.
-    """
+    """Add a prototype, carried along a flow, as `show` does. Returns 0 where nothing arrives."""
     ring = reach(residual, down, h, pitch, opens, open)
     shown = int(0)
     found = int(0)
     for y in range(h + 1):
         while shown < opens[open + y]:
-            t = here + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN)
             found = show(
                 total,
-                t,
+                here + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN),
                 shown,
                 h,
                 w,
