@@ -42,12 +42,18 @@ def kernel_work(make, backends, peers):
 
 
 def on_backend(case, name):
-    """The case on one of our backends; the arrays stay on the device."""
+    """The case on one of our backends; the arrays stay on the device, which is waited for."""
 
     def load():
         k = get_backend(name)
         arrays = [k.to_device(a) for a in case.arrays]
-        return lambda: getattr(k, case.operation)(*arrays, *case.scalars)
+
+        def run():
+            answer = getattr(k, case.operation)(*arrays, *case.scalars)
+            k.wait()
+            return answer
+
+        return run
 
     def fetch(answer):
         k = get_backend(name)

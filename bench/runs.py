@@ -109,12 +109,18 @@ def works_of(parts, plan, peers):
 
 
 def add_shares(results):
-    """Say of every row which shares of the copy bandwidth and the arithmetic peak it uses."""
+    """Say of every row which shares of the copy bandwidth and the arithmetic peak it uses.
+
+    Both are the processor's: rows of other devices have none.
+    """
+    backends = results["plan"]["backends"]
+    elsewhere = [name for name in backends if not get_backend(name).on_host]
     ends = {
         "bytes": ("bandwidth", results["machine"]["copy_gb_per_s"]),
         "operations": ("arithmetic", results["machine"]["peak_gflops"]),
     }
     for work in results["works"].values():
         for size, (share, most) in ends.items():
-            for row in work["contenders"].values() if work[size] else ():
-                row[share] = float(f"{work[size] / row['median_ms'] / most / 1e6:.3g}")
+            for who, row in work["contenders"].items() if work[size] else ():
+                if who not in elsewhere:
+                    row[share] = float(f"{work[size] / row['median_ms'] / most / 1e6:.3g}")

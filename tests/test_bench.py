@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 
@@ -12,12 +13,13 @@ import numpy as np
 import pytest
 from commands import assert_refused, run_command
 
-from mmmgpu.backends import BACKENDS
+from mmmgpu.backends import BACKENDS, get_backend
+from mmmgpu.backends.opencl_memory import OwnMemory
 from mmmgpu.bench import cases, growth, machine, peers, pipeline, runs, startup, threads
 from mmmgpu.bench.charts import draw_growth
 from mmmgpu.bench.comparison import compare_runs
 from mmmgpu.bench.endurance import measure_endurance
-from mmmgpu.bench.kernels import kernel_work
+from mmmgpu.bench.kernels import kernel_work, on_backend
 from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
 from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
 from mmmgpu.bench.targets import judge_targets
@@ -84,6 +86,36 @@ def test_all_contenders_of_a_whole_give_the_answer_of_the_reference(work):
     ours = [who for who, contender in made.contenders.items() if contender.tolerance is not None]
     assert all(found[who]["difference"] <= made.contenders[who].tolerance for who in ours)
     assert ours
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_what_is_timed_waits_for_the_device(monkeypatch, name):
+    """A launch on a GPU returns at once."""
+    waited = []
+
+    def wait(k):
+        waited.append(k)
+
+    monkeypatch.setattr(type(get_backend(name)), "wait", wait)
+    run = on_backend(small(cases.rbf)(np.random.default_rng(0)), name).load()
+    waited.clear()
+    run()
+    assert waited[-1:] == [get_backend(name)]
+
+
+def test_a_device_with_memory_of_its_own_has_no_share_of_the_processor_s(monkeypatch):
+    shared = get_backend("opencl")
+    own = replace(shared, memory=OwnMemory(shared.queue))
+    monkeypatch.setattr(runs, "get_backend", {"opencl": own, "warp": get_backend("warp")}.get)
+    results = run_of(warp=4, opencl=4, numba=5)
+    results["works"]["blend"] |= {"bytes": 1e6, "operations": 1e6}
+    results["machine"] |= {"copy_gb_per_s": 1.0, "peak_gflops": 1.0}
+    results["plan"] = {"backends": ["warp", "opencl"]}
+    runs.add_shares(results)
+    rows = results["works"]["blend"]["contenders"]
+    assert rows["warp"]["bandwidth"] == rows["warp"]["arithmetic"] == 0.25
+    assert rows["numba"]["bandwidth"] == 0.2
+    assert not {"bandwidth", "arithmetic"} & rows["opencl"].keys()
 
 
 def test_a_wrong_answer_is_not_timed():

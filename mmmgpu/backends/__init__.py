@@ -36,6 +36,13 @@ class Backend(Protocol):
     The shapes are those of `mmmgpu.operations` with exactly one batch axis.
     """
 
+    @property
+    def on_host(self) -> bool:
+        """Whether the device is the processor that this runs on."""
+
+    def wait(self) -> None:
+        """Return when all that was asked for is done: a device may still be at it."""
+
     def to_device(self, array: NDArray[Any], /) -> Any:
         """A device array of the same shape. It may share memory with `array`."""
 

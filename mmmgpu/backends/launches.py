@@ -67,6 +67,13 @@ class Launches(ABC):
     # so that not every frame allocates it anew
     scratch: Scratch = field(init=False, default_factory=Scratch, compare=False)
 
+    @property
+    @abstractmethod
+    def on_host(self) -> bool: ...
+
+    @abstractmethod
+    def wait(self) -> None: ...
+
     @abstractmethod
     def to_device(self, array: NDArray[Any]) -> Any: ...
 

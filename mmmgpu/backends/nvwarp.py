@@ -117,14 +117,22 @@ class Warp(Launches):
     device: str
     threads: int  # launches in flight
 
+    @property
+    def on_host(self) -> bool:
+        return self.device == "cpu"
+
+    def wait(self) -> None:
+        with _faults_of(self.device):
+            wp.synchronize_device(self.device)
+
     def to_device(self, array: NDArray[Any]) -> Any:
         # a strided array would come with its strides, which the launches do not look at
         host = np.ascontiguousarray(array)
         return self._allocated(lambda: wp.array(host, device=self.device, copy=False))
 
     def to_host(self, array: Any) -> F32:
+        self.wait()  # a copy from a device that failed says nothing
         with _faults_of(self.device):
-            wp.synchronize_device(self.device)  # a copy from a device that failed says nothing
             host: F32 = array.numpy()
         return host
 

@@ -160,6 +160,14 @@ class OpenCL(Launches):
     queue: Any
     memory: SharedMemory | OwnMemory
 
+    @property
+    def on_host(self) -> bool:
+        return isinstance(self.memory, SharedMemory)
+
+    def wait(self) -> None:
+        with _faults_of(self.name):
+            self.queue.finish()
+
     def to_device(self, array: NDArray[Any]) -> Any:
         if not array.size:
             return self.empty(*array.shape, dtype=array.dtype)
@@ -208,8 +216,8 @@ class OpenCL(Launches):
         """The driver has the threads."""
         if count:
             work(0, count)
-            with _faults_of(self.name):
-                self.memory.release()
+        if count and self.on_host:  # the memory of an input may be NumPy's, which may change it
+            self.wait()
 
 
 _launching = threading.Lock()  # a kernel object holds the arguments of one launch

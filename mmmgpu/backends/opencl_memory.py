@@ -50,10 +50,6 @@ class SharedMemory:
         data = cl.Buffer(self.queue.context, flags, hostbuf=array)
         return Array(data, array.shape, array.dtype, array)
 
-    def release(self) -> None:
-        """Wait for what is queued: the memory of an input may be NumPy's, which may change it."""
-        self.queue.finish()
-
     def fetch(self, array: Array) -> NDArray[Any]:
         if array.host is not None:
             return array.host
@@ -78,9 +74,6 @@ class OwnMemory:
         made = Array(self.allocate(array.nbytes), array.shape, array.dtype)
         cl.enqueue_copy(self._queue, made.data, array)
         return made
-
-    def release(self) -> None:
-        """Nothing to wait for: a queue is in order, and no memory of it is the host's."""
 
     def fetch(self, array: Array) -> NDArray[Any]:
         host = np.empty(array.shape, array.dtype)

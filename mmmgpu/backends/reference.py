@@ -5,7 +5,7 @@ fraction, the weights of the taps) is float32, as on every other backend.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,11 @@ class Prototypes:
 @dataclass(frozen=True)
 class Reference:
     """The operations in plain NumPy; device arrays are NumPy arrays."""
+
+    on_host: ClassVar[bool] = True
+
+    def wait(self) -> None:
+        """Nothing is ever left to do."""
 
     def to_device(self, array: NDArray[Any]) -> NDArray[Any]:
         return array
