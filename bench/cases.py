@@ -17,6 +17,7 @@ class Case:
     arrays, scalars: its arguments in order.
     answer: values of what it returns.
     operations: that it does at least.
+    touched: values of the first array that it reads; None: all.
     checked: items of the first array that the reference works on, where all would take minutes.
     """
 
@@ -26,12 +27,15 @@ class Case:
     answer: int
     operations: int
     scalars: tuple[float, ...] = ()
+    touched: int | None = None
     checked: int | None = None
 
     @property
     def bytes(self):
         """Read and written once."""
-        return sum(a.nbytes for a in self.arrays) + 4 * self.answer
+        first, *others = self.arrays
+        read = first.size if self.touched is None else self.touched
+        return 4 * (read + self.answer) + sum(a.nbytes for a in others)
 
 
 def smooth_flow(rng, batch, height, width):
@@ -160,13 +164,24 @@ def piecewise(rng, height=288, width=360, batch=16, across=8):
     triangles = np.concatenate([upper, lower]).astype(np.int32)
     index = np.repeat(np.arange(len(triangles)), 47).astype(np.int32)
     barycentric = rng.dirichlet(np.ones(3), len(index)).astype(np.float32)
+    places = np.einsum("pj,bpjc->bpc", barycentric, vertices[:, triangles[index]])
     return Case(
         f"piecewise_warp {batch}x{len(index)} pixels",
         "piecewise_warp",
         (field, vertices, triangles, index, barycentric),
         answer=batch * len(index) * 3,
         operations=batch * len(index) * (10 + 4 + 3 * 9),
+        touched=3 * pixels_near(places, height, width),
     )
+
+
+def pixels_near(places, height, width):
+    """How many pixels of some pictures are a corner of one of the places (B, P, 2) in each."""
+    near = np.zeros((len(places), height, width), bool)
+    x, y = np.moveaxis(places.astype(int), -1, 0)
+    for corner in np.ndindex(2, 2):
+        near[np.arange(len(places))[:, None], y + corner[0], x + corner[1]] = True
+    return np.count_nonzero(near)
 
 
 CASES = (

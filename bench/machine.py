@@ -26,6 +26,7 @@ PACKAGES = (
 COPIED = 1 << 28  # bytes: more than most caches hold
 SIDE = 1024  # of the matrices
 TURNS = 15
+PRECISIONS = "float32", "float64"
 
 
 def describe_machine():
@@ -87,14 +88,14 @@ def devices():
 
 
 def measure_machine(threads=None):
-    """Copy bandwidth [GB/s, read and written] and float32 peak [10^9 operations/s] of all threads.
+    """Copy bandwidth [GB/s, read and written] and peaks [10^9 operations/s] of all threads.
 
     The best of several turns: what the machine can do, not what it did under load.
     """
     threads = threads or default_threads()
     return {
         "copy_gb_per_s": round(copy_bandwidth(threads) / 1e9, 2),
-        "peak_gflops": round(peak(threads) / 1e9, 1),
+        **{f"{kind}_gflops": round(peak(threads, kind) / 1e9, 1) for kind in PRECISIONS},
     }
 
 
@@ -120,15 +121,15 @@ def copy_of(size, threads):
     return copy
 
 
-def peak(threads):
-    """Float32 operations a second of a product of matrices on `threads` threads."""
+def peak(threads, precision):
+    """Operations a second of a product of matrices on `threads` threads."""
     with threadpool_limits(threads):
-        return 2 * SIDE**3 / best(product())
+        return 2 * SIDE**3 / best(product(precision))
 
 
-def product():
+def product(precision="float32"):
     """A product of matrices."""
-    a = np.random.default_rng(0).random((SIDE, SIDE), dtype=np.float32)
+    a = np.random.default_rng(0).random((SIDE, SIDE), dtype=precision)
     return lambda: a @ a
 
 

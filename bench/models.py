@@ -108,6 +108,7 @@ def trajectory_work(peers, seconds=3, fps=25):
         contenders,
         bytes=DIMENSIONS * n * 3 * 8,
         operations=DIMENSIONS * n * (FACTOR + SOLVE),
+        precision="float64",
         items=n,
         unit="frame",
     )
@@ -145,6 +146,7 @@ def gdlr_work(seconds=15, fps=25):
         {"adjoint": Contender(lambda: adjoint, tolerance=SIMPLE)},
         bytes=DIMENSIONS * len(rows) * (ORDER + 2) * 8,
         operations=DIMENSIONS * (len(rows) * 2 * SOLVE + 2 * PHONES * 2 * (DIMENSIONS + 1)),
+        precision="float64",
     )
 
 
@@ -188,6 +190,7 @@ def training_work(seconds=120, fps=25, dimensions=DIMENSIONS, checked=5):
         },
         bytes=dimensions * len(rows) * 8,
         operations=dimensions * len(rows) * (FACTOR + 2 * SOLVE),
+        precision="float64",
         part=checked / dimensions,
     )
 

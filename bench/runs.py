@@ -15,14 +15,15 @@ from mmmgpu.bench.pipeline import measure_pipeline
 from mmmgpu.bench.startup import measure_startup
 from mmmgpu.bench.targets import judge_targets
 from mmmgpu.bench.threads import measure_threads
-from mmmgpu.bench.timing import QUICK, Effort, measure
+from mmmgpu.bench.timing import COPY, QUICK, Effort, measure
 from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 from mmmgpu.voices import is_installed
 
-# of the record; 4: growth and threads of fewer works; 3: single turns were not kept, references did
-# not take turns, growth by the best; 2: no pause for OpenBLAS's threads; 1: short runs once
-VERSION = 5
+# of the record; 5: one peak for all precisions, some peers packed arrays beforehand, starts by the
+# best; 4: growth and threads of fewer works; 3: single turns were not kept, references did not
+# take turns, growth by the best; 2: no pause for OpenBLAS's threads; 1: short runs once
+VERSION = 6
 PARTS = ("kernels", "wholes", "growth", "startup", "pipeline")
 
 
@@ -111,16 +112,17 @@ def works_of(parts, plan, peers):
 def add_shares(results):
     """Say of every row which shares of the copy bandwidth and the arithmetic peak it uses.
 
-    Both are the processor's: rows of other devices have none.
+    Both are the processor's: rows of other devices have none. A copy does no arithmetic.
     """
-    backends = results["plan"]["backends"]
+    machine, backends = results["machine"], results["plan"]["backends"]
     elsewhere = [name for name in backends if not get_backend(name).on_host]
-    ends = {
-        "bytes": ("bandwidth", results["machine"]["copy_gb_per_s"]),
-        "operations": ("arithmetic", results["machine"]["peak_gflops"]),
-    }
     for work in results["works"].values():
-        for size, (share, most) in ends.items():
-            for who, row in work["contenders"].items() if work[size] else ():
-                if who not in elsewhere:
-                    row[share] = float(f"{work[size] / row['median_ms'] / most / 1e6:.3g}")
+        ends = {
+            "bandwidth": (work["bytes"], machine["copy_gb_per_s"]),
+            "arithmetic": (work["operations"], machine[f"{work['precision']}_gflops"]),
+        }
+        for share, (size, most) in ends.items():
+            without = [*elsewhere, COPY] if share == "arithmetic" else elsewhere
+            for who in work["contenders"].keys() - without if size else ():
+                row = work["contenders"][who]
+                row[share] = float(f"{size / row['median_ms'] / most / 1e6:.3g}")

@@ -44,6 +44,7 @@ class Work:
     contenders: by name.
     beside: other work that takes turns with the contenders, to compare them with.
     bytes, operations: that it takes at least, for the roofline; None where they are not counted.
+    precision: that of these operations.
     items: how many things are done in one run, of the kind `unit`.
     part: the share of the work that the reference does.
     """
@@ -54,6 +55,7 @@ class Work:
     beside: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     bytes: float | None = None
     operations: float | None = None
+    precision: str = "float32"
     items: int = 1
     unit: str = "run"
     part: float = 1.0
@@ -88,7 +90,7 @@ def measure(work, effort):
     reference = seconds.pop(REFERENCE, once) / work.part
     rows = {name: statistics(*s) | found.get(name, {}) for name, s in seconds.items()}
     rows[REFERENCE] = statistics(*reference)
-    size = {"bytes": work.bytes, "operations": work.operations}
+    size = {"bytes": work.bytes, "operations": work.operations, "precision": work.precision}
     return {"items": work.items, "unit": work.unit, **size, "contenders": rows}
 
 

@@ -62,8 +62,30 @@ def test_bytes_are_those_of_the_arguments_and_the_answer(make):
     case = small(make)(np.random.default_rng(0))
     answer = kernel_work(small(make), ["numpy"], []).contenders["numpy"].load()()
     arrays = answer if isinstance(answer, tuple) else (answer,)
-    assert case.bytes == sum(a.nbytes for a in (*case.arrays, *arrays))
+    first = 4 * case.touched if case.touched else case.arrays[0].nbytes
+    assert case.bytes == first + sum(a.nbytes for a in (*case.arrays[1:], *arrays))
     assert case.operations > 0
+
+
+def test_a_piecewise_warp_reads_the_pixels_around_its_places_alone():
+    case = small(cases.piecewise)(np.random.default_rng(0))
+    field, vertices, triangles, index, barycentric = case.arrays
+    corners = vertices[:, triangles[index]]
+    places = (barycentric[..., None] * corners).sum(axis=2).reshape(-1, 2)
+    number = len(index)
+    near = {
+        (n // number, int(y) + i, int(x) + j)
+        for n, (x, y) in enumerate(places)
+        for i in (0, 1)
+        for j in (0, 1)
+    }
+    assert case.touched == 3 * len(near) < field.size / 4
+    blank = np.zeros_like(field)
+    blank[tuple(np.transpose([*near]))] = field[tuple(np.transpose([*near]))]
+    k = get_backend("numpy")
+    np.testing.assert_array_equal(
+        k.piecewise_warp(blank, *case.arrays[1:]), k.piecewise_warp(*case.arrays)
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,15 +129,31 @@ def test_a_device_with_memory_of_its_own_has_no_share_of_the_processor_s(monkeyp
     shared = get_backend("opencl")
     own = replace(shared, memory=OwnMemory(shared.queue))
     monkeypatch.setattr(runs, "get_backend", {"opencl": own, "warp": get_backend("warp")}.get)
-    results = run_of(warp=4, opencl=4, numba=5)
-    results["works"]["blend"] |= {"bytes": 1e6, "operations": 1e6}
-    results["machine"] |= {"copy_gb_per_s": 1.0, "peak_gflops": 1.0}
-    results["plan"] = {"backends": ["warp", "opencl"]}
-    runs.add_shares(results)
-    rows = results["works"]["blend"]["contenders"]
-    assert rows["warp"]["bandwidth"] == rows["warp"]["arithmetic"] == 0.25
-    assert rows["numba"]["bandwidth"] == 0.2
+    rows = with_shares(run_of(warp=4, opencl=4, numba=5), backends=["warp", "opencl"])
+    assert (rows["warp"]["bandwidth"], rows["numba"]["bandwidth"]) == (0.25, 0.2)
     assert not {"bandwidth", "arithmetic"} & rows["opencl"].keys()
+
+
+def with_shares(results, backends=("warp",), precision="float32"):
+    """The rows of a record whose work moves 1 MB and takes 10^6 operations, with their shares."""
+    work = results["works"]["blend"]
+    work |= {"bytes": 1e6, "operations": 1e6, "precision": precision}
+    peaks = {"float32_gflops": 1.0, "float64_gflops": 0.5}
+    results |= {"plan": {"backends": backends}}
+    results["machine"] |= {"copy_gb_per_s": 1.0} | peaks
+    runs.add_shares(results)
+    return work["contenders"]
+
+
+@pytest.mark.parametrize(("precision", "share"), [("float32", 0.25), ("float64", 0.5)])
+def test_arithmetic_is_judged_by_the_peak_of_its_precision(precision, share):
+    assert with_shares(run_of(warp=4), precision=precision)["warp"]["arithmetic"] == share
+
+
+def test_a_copy_has_a_share_of_the_bandwidth_alone():
+    copied = with_shares(run_of(warp=4, copy=2))["copy"]
+    assert copied["bandwidth"] == 0.5
+    assert "arithmetic" not in copied
 
 
 def test_a_wrong_answer_is_not_timed():

@@ -88,7 +88,8 @@ def show_results(results: dict[str, Any]) -> None:
     machine = results["machine"]
     title = (
         f"{machine['cpu']}, {machine['threads']} threads, {machine['copy_gb_per_s']} GB/s copied, "
-        f"{machine['peak_gflops']} GFlop/s, load {machine['load']}"
+        f"{machine['float32_gflops']} GFlop/s ({machine['float64_gflops']} in float64), "
+        f"load {machine['load']}"
     )
     print(title, f"\n{WORKS}" * bool(results["works"]))
     for name, rows in work_tables(results):
