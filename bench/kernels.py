@@ -27,17 +27,18 @@ def kernel_work(make, backends, peers):
     contenders = {name: on_backend(case, name) for name in backends}
     for library, peer in find_peers(case.operation, peers).items():
         contenders[library] = Contender(lambda peer=peer: peer(*case.arrays, *case.scalars))
-    first, *others = case.arrays
-    part = first[: case.checked]
+    first, second, *others = case.arrays
+    some = second[:: case.every]
     k = get_backend("numpy")
     return Work(
         case.name,
-        lambda: getattr(k, case.operation)(part, *others, *case.scalars),
+        lambda: getattr(k, case.operation)(first, some, *others, *case.scalars),
         contenders,
         beside={COPY: copy_of(case.bytes, default_threads())},
         bytes=case.bytes,
         operations=case.operations,
-        part=len(part) / len(first),
+        part=len(some) / len(second),
+        checked=np.s_[..., :: case.every],
     )
 
 

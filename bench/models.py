@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
 
-from mmmgpu.bench.cases import smooth_flow
+from mmmgpu.bench.cases import EVERY, smooth_flow
 from mmmgpu.bench.drawn import drawn_basis
 from mmmgpu.bench.timing import Contender, Work
 from mmmgpu.correspondence import rbf_correspondence
@@ -46,19 +46,20 @@ def matching_work(backends, prototypes=46, frames=450, side=128):
     flows = smooth_flow(rng, frames, side, side)
 
     def scan(name, some):
-        views = [View(map_, basis.flows[1:][:some], flows)]
+        views = [View(map_, basis.flows[1:], some)]
         return FlowScan(basis, views, backend=name)().min(axis=0)
 
     pixels = int((basis.w_f > 0.02).sum())
     return Work(
         f"matching scan, {prototypes} prototypes, {frames} frames of {side}x{side}",
-        lambda: scan("numpy", 1),
-        {n: Contender(lambda n=n: lambda: scan(n, prototypes), tolerance=1e-5) for n in backends},
+        lambda: scan("numpy", flows[::EVERY]),
+        {n: Contender(lambda n=n: lambda: scan(n, flows), tolerance=1e-5) for n in backends},
         bytes=frames * pixels * 2 * 4 * 3,
         operations=prototypes * frames * pixels * 12 + frames * pixels * (22 + 4 * frames),
         items=frames,
         unit="frame",
-        part=1 / prototypes,
+        part=1 / EVERY,
+        checked=np.s_[:, ::EVERY],
     )
 
 
@@ -192,6 +193,7 @@ def training_work(seconds=120, fps=25, dimensions=DIMENSIONS, checked=5):
         operations=dimensions * len(rows) * (FACTOR + 2 * SOLVE),
         precision="float64",
         part=checked / dimensions,
+        checked=np.s_[:checked],
     )
 
 

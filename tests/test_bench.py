@@ -23,7 +23,17 @@ from mmmgpu.bench.kernels import kernel_work, on_backend
 from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
 from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
 from mmmgpu.bench.targets import judge_targets
-from mmmgpu.bench.timing import LEAST, SLOW, Contender, Effort, Work, measure, take_turns, timed
+from mmmgpu.bench.timing import (
+    LEAST,
+    SLOW,
+    Contender,
+    Effort,
+    Work,
+    as_tuple,
+    measure,
+    take_turns,
+    timed,
+)
 from mmmgpu.errors import InputError
 from mmmgpu.progress import progress
 
@@ -38,7 +48,7 @@ SMALL = {
     "equations": {"number": 5, "height": 9, "width": 7},
     "sample": {"height": 12, "width": 17},
     "sample_at_random": {"height": 12, "width": 17},
-    "scan": {"queries": 3, "corpus": 5, "points": 40},
+    "scan": {"queries": 3, "corpus": 7, "points": 40},
     "rbf": {"height": 12, "width": 9, "number": 8},
     "piecewise": {"batch": 2},
 }
@@ -163,6 +173,32 @@ def test_a_wrong_answer_is_not_timed():
         measure(Work("sums", lambda: right, contenders), ONCE)
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(kernel_work, small(cases.scan), ["opencl"], []),
+        partial(synthesis_work, ["opencl"], [], prototypes=4, side=48, frames=9),
+        partial(mouths_work, ["opencl"], prototypes=4, side=48, frames=9),
+        partial(analysis_work, ["opencl"], prototypes=6, side=48, frames=3),
+        partial(matching_work, ["opencl"], prototypes=4, frames=6, side=32),
+    ],
+    ids=["scan", "synthesis", "mouths", "analysis", "matching"],
+)
+def test_of_every_query_prototype_and_frame_a_wrong_answer_is_not_timed(make):
+    work = make()
+    right = work.contenders["opencl"]
+
+    def fetch(answer):
+        arrays = [np.array(a) for a in as_tuple(right.fetch(answer))]
+        for a in arrays:
+            a[-1] += 1
+        return tuple(arrays)
+
+    wrong = replace(work, contenders={"opencl": replace(right, fetch=fetch)})
+    with pytest.raises(InputError, match="differs from the reference"):
+        measure(wrong, ONCE)
+
+
 def test_an_answer_that_is_no_number_is_not_timed():
     contenders = {"fast": Contender(lambda: lambda: np.array([np.nan]), tolerance=1e-3)}
     with pytest.raises(InputError, match="differs"):
@@ -213,7 +249,8 @@ def test_a_quick_reference_takes_turns(pause, turns):
 
 
 def test_the_reference_s_part_counts_for_the_whole():
-    work = Work("w", lambda: np.ones(2), {"a": Contender(lambda: lambda: np.ones(4))}, part=1e-6)
+    runs = {"a": Contender(lambda: lambda: np.ones(4))}
+    work = Work("w", lambda: np.ones(2), runs, part=1e-6, checked=np.s_[:2])
     found = measure(work, ONCE)["contenders"]
     assert found["reference"]["median_ms"] > 100 * found["a"]["median_ms"]
 
