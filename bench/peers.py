@@ -1,10 +1,12 @@
 """Other libraries, one module each, with the operations that they can do by the same names.
 
-A peer takes the arrays of a case and returns the function to time, so that what a user would
-prepare once is not timed. It gives its best form of the work: its own layout, all threads.
+A peer takes the arrays of a case as our operation does, and returns the answer: what it packs or
+prepares is timed, as ours is. It gives its best form of the work: its own layout, all threads.
 """
 
 import importlib
+
+from threadpoolctl import threadpool_limits
 
 LIBRARIES = {
     "numpy": "peers_numpy",
@@ -39,3 +41,12 @@ def split_by_presence(libraries):
         else:
             present.append(name)
     return present, absent
+
+
+def use_threads(number, libraries):
+    """Let BLAS, and those libraries that have threads of their own, use so many from now on."""
+    threadpool_limits(number)
+    for name in libraries:
+        module = importlib.import_module(f"mmmgpu.bench.{LIBRARIES[name]}")
+        if hasattr(module, "use_threads"):
+            module.use_threads(number)

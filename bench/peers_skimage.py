@@ -17,8 +17,5 @@ def sample(field, points):
         channels = [warp(c, given, order=1, mode="edge") for c in np.moveaxis(picture, -1, 0)]
         return np.stack(channels, -1)
 
-    def run():
-        pictures = [one(f, p) for f, p in zip(field, places, strict=True)]
-        return np.stack(pictures).reshape(*points.shape[:2], -1)
-
-    return run
+    pictures = [one(f, p) for f, p in zip(field, places, strict=True)]
+    return np.stack(pictures).reshape(*points.shape[:2], -1)

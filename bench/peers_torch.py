@@ -7,10 +7,12 @@ import numpy as np
 torch = importlib.import_module("torch")
 
 
+use_threads = torch.set_num_threads
+
+
 def forward_warp(field, flow):
     """Four `index_add_` for each picture."""
     height, width, channels = field.shape[1:]
-    values, q = torch.from_numpy(field), torch.from_numpy(flow)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
 
     def one(picture, along):
@@ -31,11 +33,9 @@ def forward_warp(field, flow):
         mean = torch.where(weight > 0, total[:, :channels] / weight, 0)
         return mean.reshape(height, width, channels), weight.reshape(height, width)
 
-    def run():
-        pairs = [one(a, b) for a, b in zip(values, q, strict=True)]
-        return tuple(torch.stack(part).numpy() for part in zip(*pairs, strict=True))
-
-    return run
+    given = zip(torch.from_numpy(field), torch.from_numpy(flow), strict=True)
+    pairs = [one(a, b) for a, b in given]
+    return tuple(torch.stack(part).numpy() for part in zip(*pairs, strict=True))
 
 
 def sample(field, points):
@@ -43,27 +43,22 @@ def sample(field, points):
     height, width = field.shape[1:3]
     planes = torch.from_numpy(np.ascontiguousarray(np.moveaxis(field, -1, 1)))
     unit = torch.tensor([2 / (width - 1), 2 / (height - 1)])
-    given = torch.from_numpy(points)
     options = {"mode": "bilinear", "padding_mode": "border", "align_corners": True}
-
-    def run():
-        grid = (given * unit - 1)[:, None]
-        found = torch.nn.functional.grid_sample(planes, grid, **options)
-        return found[:, :, 0].movedim(1, -1).contiguous().numpy()
-
-    return run
+    grid = (torch.from_numpy(points) * unit - 1)[:, None]
+    found = torch.nn.functional.grid_sample(planes, grid, **options)
+    return found[:, :, 0].movedim(1, -1).contiguous().numpy()
 
 
 def blend(images, weights):
     """One product with a row of weights."""
     flat, shares = torch.from_numpy(images.reshape(len(images), -1)), torch.from_numpy(weights)
-    return lambda: (shares @ flat).numpy().reshape(-1, *images.shape[1:])
+    return (shares @ flat).numpy().reshape(-1, *images.shape[1:])
 
 
 def normal_equations(images, wanted):
     """Two products."""
     rows, column = torch.from_numpy(images.reshape(len(images), -1)), torch.from_numpy(wanted)
-    return lambda: torch.vstack([rows @ rows.T, column.reshape(1, -1) @ rows.T]).numpy()
+    return torch.vstack([rows @ rows.T, column.reshape(1, -1) @ rows.T]).numpy()
 
 
 def distance_scan(queries, corpus, weights):
@@ -72,20 +67,12 @@ def distance_scan(queries, corpus, weights):
         torch.from_numpy(np.ascontiguousarray(np.moveaxis(a, -1, 0))) for a in (queries, corpus)
     )
     w = torch.from_numpy(weights)
-
-    def run():
-        rows = [torch.hypot(q[0] - c[0, n], q[1] - c[1, n]) @ w for n in range(len(corpus))]
-        return torch.stack(rows, 1).numpy()
-
-    return run
+    rows = [torch.hypot(q[0] - c[0, n], q[1] - c[1, n]) @ w for n in range(len(corpus))]
+    return torch.stack(rows, 1).numpy()
 
 
 def evaluate_rbf(points, centres, weights, affine, sharpness):
     """All Gaussians at once."""
     p, c, w, a = (torch.from_numpy(x) for x in (points, centres, weights, affine))
-
-    def run():
-        squares = torch.cdist(p, c) ** 2
-        return (a[:, 0] + p @ a[:, 1:].T + torch.exp(-sharpness * squares) @ w).numpy()
-
-    return run
+    squares = torch.cdist(p, c) ** 2
+    return (a[:, 0] + p @ a[:, 1:].T + torch.exp(-sharpness * squares) @ w).numpy()

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from mmmgpu.backends import get_backend
+from mmmgpu.backends import default_threads, get_backend
 from mmmgpu.bench.endurance import measure_endurance
 from mmmgpu.bench.growth import measure_growth
 from mmmgpu.bench.kernels import kernel_works
 from mmmgpu.bench.machine import describe_machine, measure_machine
 from mmmgpu.bench.models import model_works
-from mmmgpu.bench.peers import LIBRARIES, split_by_presence
+from mmmgpu.bench.peers import LIBRARIES, split_by_presence, use_threads
 from mmmgpu.bench.pictures import picture_works
 from mmmgpu.bench.pipeline import measure_pipeline
 from mmmgpu.bench.startup import measure_startup
@@ -50,6 +50,8 @@ class Plan:
 def run_benchmarks(plan):
     """Everything that `plan` asks for, as JSON values.
 
+    All libraries use the threads that ours do.
+
     Raises:
         InputError: A part, work or backend does not exist; an answer differs from the reference.
     """
@@ -57,6 +59,7 @@ def run_benchmarks(plan):
     for name in plan.backends:
         get_backend(name)
     present, absent = split_by_presence(LIBRARIES if plan.peers else ())
+    use_threads(default_threads(), present)
     works = works_of(parts, plan, present)
     effort = QUICK if plan.quick else Effort()
     before = measure_machine()

@@ -41,7 +41,7 @@ def line(who, row, slow, best, work):
 
 def is_peer(who):
     """Whether a contender is another library."""
-    return who not in (REFERENCE, COPY) and who.partition(":")[0] not in OURS
+    return not who.startswith((REFERENCE, COPY)) and who.partition(":")[0] not in OURS
 
 
 def percent(share):

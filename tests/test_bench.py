@@ -1,5 +1,6 @@
 """The benchmarks: right answers before times, honest counts, and what a comparison calls slower."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -9,11 +10,13 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 
+import cv2
 import numpy as np
 import pytest
 from commands import assert_refused, run_command
+from threadpoolctl import threadpool_info
 
-from mmmgpu.backends import BACKENDS, get_backend
+from mmmgpu.backends import BACKENDS, default_threads, get_backend
 from mmmgpu.backends.opencl_memory import OwnMemory
 from mmmgpu.bench import cases, growth, machine, peers, pipeline, runs, startup, threads
 from mmmgpu.bench.charts import draw_growth
@@ -22,6 +25,7 @@ from mmmgpu.bench.endurance import measure_endurance
 from mmmgpu.bench.kernels import kernel_work, on_backend
 from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
 from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
+from mmmgpu.bench.tables import work_tables
 from mmmgpu.bench.targets import judge_targets
 from mmmgpu.bench.timing import (
     LEAST,
@@ -260,6 +264,40 @@ def test_a_library_that_is_missing_is_named(monkeypatch):
     present, absent = peers.split_by_presence(peers.LIBRARIES)
     assert absent[-1] == "fortran"
     assert {"numpy", "opencv", "scipy"} <= set(present)
+
+
+@pytest.fixture
+def one_thread(monkeypatch):
+    monkeypatch.setenv("MMMGPU_THREADS", "1")
+    yield
+    monkeypatch.delenv("MMMGPU_THREADS")
+    peers.use_threads(default_threads(), PEERS)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_libraries_use_the_threads_that_ours_do(monkeypatch):
+    used = {}
+
+    def ask(*_):
+        used.update(opencv=cv2.getNumThreads())
+        used.update({pool["filepath"]: pool["num_threads"] for pool in threadpool_info()})
+        if "numba" in PEERS:
+            used["numba"] = importlib.import_module("numba").get_num_threads()
+        return {}
+
+    monkeypatch.setattr(runs, "measure_startup", ask)
+    monkeypatch.setattr(machine, "COPIED", 1 << 20)
+    runs.run_benchmarks(runs.Plan(parts=["startup"], peers=True))
+    assert {*used.values()} == {1}
+
+
+def test_the_reference_in_another_form_is_no_peer():
+    rows = run_of(adjoint=4, scipy=8, copy=1, **{"reference": 50, "reference, factor kept": 2})
+    rows["works"]["blend"] |= {"items": 1, "unit": "run"}
+    for row in rows["works"]["blend"]["contenders"].values():
+        row["cpu_ms"] = 1
+    ((_, lines),) = work_tables(rows)
+    assert lines[0].split()[6:8] == ["12.5", "2.00"]
 
 
 def run_of(**medians):
