@@ -142,13 +142,13 @@ TARGETS = (
     Target("threads, forward_warp", 1.7, gain("splat")),
     Target("threads, fill_holes", 1.7, gain("fill")),
     Target("threads, normal_equations", 1.7, gain("equations")),
+    Target("threads, sample", 1.7, gain("sample")),
     Target("threads, distance_scan", 1.7, gain("scan")),
     Target("threads, dense RBF", 1.7, gain("rbf")),
     Target("threads, piecewise_warp", 1.7, gain("piecewise")),
     Target("threads, synthesis", 1.7, gain("synthesis")),
     Target("threads, analysis", 1.7, gain("analysis")),
     Target("threads, blend, of a copy's gain", 0.9, gain_beside_copy("blend")),
-    Target("threads, sample, of a copy's gain", 0.9, gain_beside_copy("sample")),
     Target("first frame, full cache [s]", 1, slowest_start, most=True),
 )
 

@@ -21,8 +21,11 @@ from mmmgpu.bench.pictures import picture_works
 from mmmgpu.bench.timing import COPY, timed
 from mmmgpu.errors import InputError
 
-COMPUTE_BOUND = ("splat", "fill", "equations", "scan", "rbf", "piecewise", "synthesis", "analysis")
-MEMORY_BOUND = ("blend", "sample")  # beside a copy of as many bytes each
+COMPUTE_BOUND = (
+    *("splat", "fill", "equations", "sample", "scan", "rbf", "piecewise"),
+    *("synthesis", "analysis"),
+)
+MEMORY_BOUND = ("blend",)  # beside a copy of as many bytes
 MACHINE = {"copy": lambda: copy_of(2 * COPIED, default_threads()), "product": product}
 
 

@@ -350,11 +350,20 @@ def test_a_target_is_met_or_not_by_the_best_backend():
     assert values["backends apart by at most"] == (2.25, False)
     assert "analysis [frames/s]" not in found  # nothing was measured
     results["threads"] = {
-        "gain": {"sample, copy": [1, 2], "sample, warp": [1, 1.9], "scan, warp": [1, 3]}
+        "gain": {"blend, copy": [1, 2], "blend, warp": [1, 1.9], "sample, warp": [1, 3]}
     }
     values = {name: (t["value"], t["met"]) for name, t in judge_targets(results).items()}
-    assert values["threads, sample, of a copy's gain"] == (0.95, True)
-    assert values["threads, distance_scan"] == (3, True)
+    assert values["threads, blend, of a copy's gain"] == (0.95, True)
+    assert values["threads, sample"] == (3, True)
+
+
+def test_every_work_that_is_timed_with_more_threads_has_a_target():
+    gained = {f"{work}, warp": [1, 2] for work in (*threads.COMPUTE_BOUND, *threads.MEMORY_BOUND)}
+    gained |= {f"{work}, copy": [1, 2] for work in threads.MEMORY_BOUND}
+    found = judge_targets({"works": {}, "threads": {"gain": gained}})
+    bounds = [t["bound"] for name, t in found.items() if name.startswith("threads, ")]
+    assert bounds.count(">= 1.7") == len(threads.COMPUTE_BOUND)
+    assert bounds.count(">= 0.9") == len(threads.MEMORY_BOUND)
 
 
 def test_the_gain_of_threads_is_that_of_the_faster_backend():
