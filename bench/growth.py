@@ -6,11 +6,14 @@ another size may not have had; medians of as many turns scatter less. Frames beg
 launch takes. Of fewer, two workers re-orient less than four each together: another kind of work.
 """
 
+from functools import partial
+
 import numpy as np
 
 from mmmgpu.bench import cases
 from mmmgpu.bench.drawn import drawn_basis, drawn_coordinates
 from mmmgpu.bench.kernels import on_backend
+from mmmgpu.bench.models import FPS, gdlr_work, matching_work, training_work, trajectory_work
 from mmmgpu.bench.pictures import analysis_work, synthesis
 from mmmgpu.bench.timing import timed
 
@@ -25,6 +28,21 @@ def analyses_of(name, prototypes=16, side=128, frames=4):
     """Analysis of so many frames, to be timed."""
     work = analysis_work([name], prototypes=prototypes, side=side, frames=frames)
     return work.contenders[name].load()
+
+
+def matching_of(name, frames):
+    """The matching scan of so many frames, to be timed."""
+    work = matching_work([name], prototypes=16, frames=frames, side=64)
+    return work.contenders[name].load()
+
+
+def solves(make, who):
+    """Makes one of `bench.models` on the host to be timed, of so many frames."""
+
+    def of(_, frames):
+        return make(seconds=frames // FPS).contenders[who].load()
+
+    return of
 
 
 def operation(make, *sizes, **fixed):
@@ -42,17 +60,23 @@ def square(n):
     return n * n
 
 
-SIDES, NUMBERS = (64, 128, 256), (8, 16, 32)
+SIDES, NUMBERS = (128, 256, 512), (8, 16, 32)
+LONG = (750, 1500, 3000)  # frames
 SIDE = "height", "width"
 AXES = {  # what grows, of which work: sizes, what is timed, what is counted
     "pixels, synthesis": (SIDES, lambda name, n: pictures_of(name, side=n), square),
     "prototypes, synthesis": (NUMBERS, lambda name, n: pictures_of(name, prototypes=n), int),
     "frames, synthesis": (
-        (8, 16, 32, 64),
+        (8, 32, 64),
         lambda name, n: pictures_of(name, frames=n, side=96),
         int,
     ),
     "pixels, analysis": (SIDES, lambda name, n: analyses_of(name, side=n), square),
+    "frames, analysis": (
+        (4, 8, 16),
+        lambda name, n: analyses_of(name, frames=n, side=96),
+        int,
+    ),
     "prototypes, analysis": (NUMBERS, lambda name, n: analyses_of(name, prototypes=n), int),
     "pixels, forward_warp": (SIDES, operation(cases.splat, *SIDE, batch=16), square),
     "pixels, fill_holes": (SIDES, operation(cases.fill, *SIDE, batch=16), square),
@@ -71,18 +95,24 @@ AXES = {  # what grows, of which work: sizes, what is timed, what is counted
     ),
     "pixels, evaluate_rbf": (SIDES, operation(cases.rbf, *SIDE), square),
     "pictures, piecewise_warp": ((4, 16, 64), operation(cases.piecewise, "batch"), int),
+    "frames, matching scan": ((256, 512, 1024), matching_of, int),
+}
+HOST = {  # the same of what no backend does
+    "frames, trajectory": (LONG, solves(partial(trajectory_work, ()), "ours"), int),
+    "frames, GDLR gradient": (LONG, solves(gdlr_work, "adjoint"), int),
+    "frames, training gradient": (LONG, solves(training_work, "adjoint"), int),
 }
 LINEAR = ("pixels", "frames", "pictures", "corpus rows")  # with what the time is to grow so
 
 
 def measure_growth(backends, turns):
     """For every axis and backend: sizes, median times [ms] and the exponent."""
-    return {axis: {name: grown(axis, name, turns) for name in backends} for axis in AXES}
+    found = {axis: {n: grown(*AXES[axis], n, turns) for n in backends} for axis in AXES}
+    return found | {axis: {"ours": grown(*HOST[axis], "ours", turns)} for axis in HOST}
 
 
-def grown(axis, name, turns):
+def grown(sizes, make, count, name, turns):
     """Sizes in turns, so that all of them see the same load."""
-    sizes, make, count = AXES[axis]
     runs = [make(name, size) for size in sizes]
     for run in runs:
         run()

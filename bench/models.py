@@ -20,6 +20,7 @@ from mmmgpu.trajectories import (
 )
 
 DIMENSIONS, PHONES, CLASSES, ORDER, LAMBDA = 50, 40, 6, 4, 1.0
+FPS = 25
 SIMPLE = 1e-8  # of the scale of what is solved for
 FACTOR, SOLVE = (ORDER + 1) ** 2, 4 * ORDER + 1  # operations of a frame, of a banded system
 
@@ -75,7 +76,7 @@ def speech(frames, seed=0):
     return models, rows
 
 
-def trajectory_work(peers, seconds=3, fps=25):
+def trajectory_work(peers, seconds=3, fps=FPS):
     """Eq. 3 for a sentence in all dimensions; the reference solves one dense system a dimension."""
     models, rows = speech(seconds * fps)
     labels = [models.labels[row] for row in rows]
@@ -116,7 +117,7 @@ def trajectory_work(peers, seconds=3, fps=25):
     )
 
 
-def gdlr_work(seconds=15, fps=25):
+def gdlr_work(seconds=15, fps=FPS):
     """dE/dR of Eq. 17 by the adjoint; the reference solves Eq. 16 for each entry of R in turn.
 
     It uses the factor of A that is there already, and that an entry moves one dimension only.
@@ -152,7 +153,7 @@ def gdlr_work(seconds=15, fps=25):
     )
 
 
-def training_work(seconds=120, fps=25, dimensions=DIMENSIONS, checked=5):
+def training_work(seconds=120, fps=FPS, dimensions=DIMENSIONS, checked=5):
     """The gradient of Eq. 4 by the adjoint; the reference solves Eq. 16 for each mu and sigma.
 
     It solves the whole system for each, as the formula says, in the dimensions that are checked.

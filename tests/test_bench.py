@@ -390,23 +390,50 @@ def test_ratios_are_those_within_a_turn(theirs, value):
 @pytest.mark.parametrize("power", [0.5, 1, 2])
 def test_the_exponent_of_growth_is_that_of_the_power_law(monkeypatch, power):
     axis = (2, 4, 8), lambda name, n: lambda: n, int
-    monkeypatch.setitem(growth.AXES, "pages", axis)
     monkeypatch.setattr(growth, "timed", lambda run: (0.1 * run() ** power, 0))
-    assert growth.grown("pages", "warp", 2)["exponent"] == pytest.approx(power)
+    assert growth.grown(*axis, "warp", 2)["exponent"] == pytest.approx(power)
 
 
 def test_a_turn_that_is_lucky_for_one_size_is_not_growth(monkeypatch):
     axis = (2, 4, 8), lambda name, n: lambda: n, int
     lucky = iter([2, 1, *[1] * 100])
-    monkeypatch.setitem(growth.AXES, "pages", axis)
     monkeypatch.setattr(growth, "timed", lambda run: (run() / next(lucky), 0))
-    assert growth.grown("pages", "warp", 5)["exponent"] == pytest.approx(1)
+    assert growth.grown(*axis, "warp", 5)["exponent"] == pytest.approx(1)
+
+
+SMALL_AXES = {"pages": ((1, 2), lambda name, n: lambda: n, int)}
+
+
+def test_what_no_backend_does_is_measured_once(monkeypatch):
+    monkeypatch.setattr(growth, "AXES", SMALL_AXES)
+    monkeypatch.setattr(growth, "HOST", {"frames": SMALL_AXES["pages"]})
+    monkeypatch.setattr(growth, "timed", lambda run: (run(), 0))
+    found = growth.measure_growth(OURS, 1)
+    assert {axis: [*names] for axis, names in found.items()} == {
+        "pages": [*OURS],
+        "frames": ["ours"],
+    }
+
+
+LENGTHS = {  # of what a work gives for its frames
+    "frames, synthesis": len,
+    "frames, analysis": lambda answer: len(answer[0]),
+    "frames, matching scan": lambda answer: answer.shape[1],
+    "frames, trajectory": len,
+}
+
+
+@pytest.mark.parametrize("axis", LENGTHS)
+def test_frames_that_grow_are_frames_that_are_made(axis):
+    _, make, _ = (growth.AXES | growth.HOST)[axis]
+    assert [LENGTHS[axis](make("opencl", n)()) for n in (25, 50)] == [25, 50]
 
 
 @pytest.mark.parametrize(("quick", "turns"), [(True, 3), (False, 11)])
 def test_growth_takes_as_many_turns_as_single_works(monkeypatch, quick, turns):
     taken = []
-    monkeypatch.setattr(growth, "AXES", {"pages": ((1, 2), lambda name, n: lambda: n, int)})
+    monkeypatch.setattr(growth, "AXES", SMALL_AXES)
+    monkeypatch.setattr(growth, "HOST", {})
     monkeypatch.setattr(growth, "timed", lambda run: (taken.append(run()) or run(), 0))
     monkeypatch.setattr(runs, "measure_threads", lambda *_, **__: {})
     runs.run_benchmarks(runs.Plan(backends=["warp"], parts=["growth"], quick=quick))
