@@ -1,14 +1,24 @@
 """How long a new process takes to its first frame, with an empty kernel cache and with a full one.
 
-The process is one of its own each time: the interpreter's start and all imports count.
+The process is one of its own each time: the interpreter's start and all imports count. Another one
+with an empty cache says how long the kernels of each operation take to compile, on its standard
+output: ``python -m mmmgpu.bench.startup BACKEND``.
 """
 
+import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
 
+import numpy as np
+
+from mmmgpu.bench.cases import CASES
+from mmmgpu.bench.drawn import drawn_basis, drawn_coordinates
+from mmmgpu.bench.kernels import on_backend
+from mmmgpu.bench.pictures import synthesis
 from mmmgpu.errors import InputError
 
 FIRST_FRAME = """
@@ -27,21 +37,70 @@ print(next(synthesize(basis, alpha, beta, backend=sys.argv[1])).mean())
 
 
 def measure_startup(backends, *, turns=3):
-    """Seconds to the first frame: the first process of a cache, and the best of those after it."""
+    """Seconds to the first frame: the first process of a cache, and the median of those after it.
+
+    And those to compile the kernels of each operation.
+    """
     found = {}
     for name in backends:
         with tempfile.TemporaryDirectory() as cache:
             first, *later = (first_frame(name, cache) for _ in range(1 + turns))
-        found[name] = {"empty_cache_s": round(first, 2), "full_cache_s": round(min(later), 2)}
+        with tempfile.TemporaryDirectory() as cache:
+            compiled = json.loads(run_new("-m", "mmmgpu.bench.startup", name, cache=cache))
+        found[name] = {
+            "empty_cache_s": round(first, 2),
+            "full_cache_s": round(statistics.median(later), 2),
+            "compiled_s": compiled,
+        }
     return found
 
 
 def first_frame(backend, cache):
     """Seconds that a new process takes to its first frame, with kernels cached in that folder."""
-    environment = os.environ | {"WARP_CACHE_PATH": cache, "XDG_CACHE_HOME": cache}
-    call = [sys.executable, "-c", FIRST_FRAME, backend]
     start = time.perf_counter()
+    run_new("-c", FIRST_FRAME, backend, cache=cache)
+    return time.perf_counter() - start
+
+
+def run_new(*arguments, cache):
+    """What a new process prints that keeps its kernels in that folder.
+
+    Raises:
+        InputError: It failed.
+    """
+    environment = os.environ | {"WARP_CACHE_PATH": cache, "XDG_CACHE_HOME": cache}
+    call = [sys.executable, *arguments]
     done = subprocess.run(call, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise InputError(f"no first frame on {backend}: {done.stderr.strip().splitlines()[-1]}")
+        said = done.stderr.strip().splitlines()[-1]
+        raise InputError(f"no first frame on {arguments[-1]}: {said}")
+    return done.stdout
+
+
+def compile_all(backend):
+    """Seconds by operation: its first run in this process, less the next one.
+
+    The first operation has the compiler's own start in it.
+    """
+    rng = np.random.default_rng(0)
+    makers = {case.operation: on_backend(case, backend) for case in (make(rng) for make in CASES)}
+    basis, coordinates = drawn_basis(8, 96), drawn_coordinates(8, 4)
+    makers["mix_prototypes"] = synthesis(basis, coordinates, backend)
+    return {name: compiled(contender.load()) for name, contender in makers.items()}
+
+
+def compiled(run):
+    """Seconds that the first run takes longer than the second."""
+    first, second = (seconds(run) for _ in range(2))
+    return round(max(first - second, 0.0), 2)
+
+
+def seconds(run):
+    """Of one run."""
+    start = time.perf_counter()
+    run()
     return time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    print(json.dumps(compile_all(sys.argv[1])))

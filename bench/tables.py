@@ -3,7 +3,7 @@
 from mmmgpu.bench.timing import COPY, REFERENCE
 
 WORKS = f"{'':32}  median ms          quartiles   cpu ms  x ref  x peer    bytes    flops"
-WORKS += "    first     load  differs"
+WORKS += "    first    moved  differs"
 OURS = ("warp", "opencl", "ours", "adjoint")
 
 
@@ -13,8 +13,8 @@ def work_tables(results):
     cpu: of all threads, the least of all runs; threads that spin count.
     x ref, x peer: how many times faster than the reference, and than the best other library.
     bytes, flops: shares of the copy bandwidth and of the arithmetic peak.
-    first, load: [ms] the first run, which compiles or fetches kernels; and to bring arrays to the
-        device and results back, of wholes with all that is prepared once.
+    first, moved: [ms] the first run, in which kernels are fetched from the cache or compiled; and
+        to bring arrays to the device and results back, of wholes with all that is prepared once.
     differs: from the reference, as a share of its scale.
     """
     for work in results["works"].values():
@@ -70,6 +70,9 @@ def other_tables(results):
     if startup := results.get("startup"):
         rows = [(name, s["empty_cache_s"], s["full_cache_s"]) for name, s in startup.items()]
         yield "First frame of a new process [s]", ("by", "empty cache", "full cache"), rows
+        times = [s["compiled_s"] for s in startup.values()]
+        rows = [(operation, *(t[operation] for t in times)) for operation in times[0]]
+        yield "Compiled for an empty cache [s]", ("kernels of", *startup), rows
     if pipeline := results.get("pipeline"):
         for name, step in pipeline["steps"].items():
             rows = [(where, percent(share)) for where, share in step["profile"].items()]

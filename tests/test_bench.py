@@ -491,6 +491,28 @@ def test_many_frames_leave_nothing_behind(backend):
     assert files[-1] == files[10]
 
 
+def test_a_start_is_the_median_of_those_with_a_full_cache(monkeypatch):
+    taken = iter([9.0, 1.0, 3.0, 2.0])
+    monkeypatch.setattr(startup, "first_frame", lambda *_: next(taken))
+    monkeypatch.setattr(startup, "run_new", lambda *_, **__: '{"blend": 0.5}')
+    found = {"empty_cache_s": 9, "full_cache_s": 2, "compiled_s": {"blend": 0.5}}
+    assert startup.measure_startup(["warp"], turns=3) == {"warp": found}
+
+
+@pytest.mark.parametrize(("taken", "compiled"), [([0.3, 0.1], 0.2), ([0.1, 0.11], 0)])
+def test_to_compile_is_what_the_first_run_takes_longer(monkeypatch, taken, compiled):
+    left = iter(taken)
+    monkeypatch.setattr(startup, "seconds", lambda _: next(left))
+    assert startup.compiled(None) == compiled
+
+
+def test_all_operations_are_compiled_in_a_new_process(monkeypatch):
+    monkeypatch.setattr(startup, "CASES", [small(make) for make in cases.CASES])
+    found = startup.compile_all("numpy")
+    operations = {make(np.random.default_rng(0)).operation for make in startup.CASES}
+    assert found.keys() == {*operations, "mix_prototypes"}
+
+
 def test_a_first_frame_that_fails_says_why(tmp_path):
     assert startup.first_frame("numpy", str(tmp_path)) > 0.1
     with pytest.raises(InputError, match=r"no first frame on warp:cuda:99: .*there is no device"):
