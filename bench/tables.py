@@ -82,9 +82,8 @@ def other_tables(results):
         rows = [("resident [MB]", memory[0], memory[-1]), ("open files", files[0], files[-1])]
         yield f"{found['frames']} frames on {name}", ("", "first", "last"), rows
     if targets := results.get("targets"):
-        rows = [
-            (n, t["bound"], t["value"], "yes" if t["met"] else "NO") for n, t in targets.items()
-        ]
+        said = {True: "yes", False: "NO", None: "not judged"}
+        rows = [(n, t["bound"] or "", t["value"], said[t["met"]]) for n, t in targets.items()]
         yield "What must hold", ("target", "bound", "measured", "met"), rows
 
 

@@ -25,7 +25,7 @@ from mmmgpu.bench.endurance import measure_endurance
 from mmmgpu.bench.kernels import kernel_work, on_backend
 from mmmgpu.bench.models import gdlr_work, matching_work, training_work, trajectory_work
 from mmmgpu.bench.pictures import analysis_work, mouths_work, synthesis_work
-from mmmgpu.bench.tables import work_tables
+from mmmgpu.bench.tables import other_tables, work_tables
 from mmmgpu.bench.targets import judge_targets
 from mmmgpu.bench.timing import (
     LEAST,
@@ -355,6 +355,17 @@ def test_a_target_is_met_or_not_by_the_best_backend():
     values = {name: (t["value"], t["met"]) for name, t in judge_targets(results).items()}
     assert values["threads, blend, of a copy's gain"] == (0.95, True)
     assert values["threads, sample"] == (3, True)
+
+
+def test_a_pass_of_a_large_copy_is_shown_and_not_judged():
+    results = run_of(warp=4, opencl=2, copy=2)
+    with_shares(results, backends=["warp", "opencl"])
+    found = judge_targets({"works": {"blend": results["works"]["blend"] | {"items": 1}}})
+    assert found["blend, passes over its bytes"]["value"] == 1
+    long = found["blend, passes of a large copy"]
+    assert long == {"bound": None, "value": 2, "met": None}  # 1 MB in 2 ms, at 1 GB/s 1 ms
+    ((_, _, rows),) = other_tables({"targets": {"long": long}})
+    assert rows == [("long", "", 2, "not judged")]
 
 
 def test_every_work_that_is_timed_with_more_threads_has_a_target():
