@@ -91,3 +91,9 @@ def compared_rows(found):
     """A row for each contender of ours of `bench.comparison.compare_runs`."""
     for row in found["rows"]:
         yield tuple(row[key] for key in ("work", "by", "old_ms", "new_ms", "times", "verdict"))
+
+
+def compared_others(found):
+    """The same of all but works."""
+    for row in found["others"]:
+        yield tuple(row[key] for key in ("what", "by", "old", "new", "times", "verdict"))

@@ -334,8 +334,38 @@ def test_overlapping_quartiles_are_noise():
 def test_works_of_other_sizes_are_not_compared():
     other = run_of(warp=10)
     other["works"]["blend"]["name"] = "a larger blend"
-    with pytest.raises(InputError, match="no work in common"):
+    with pytest.raises(InputError, match="nothing in common"):
         compare_runs(run_of(warp=10), other)
+
+
+OTHERS = {
+    "growth": lambda value: {"growth": {"pixels": {"warp": {"exponent": value}}}},
+    "threads": lambda value: {"threads": {"gain": {"scan, warp": [1, value]}}},
+    "startup": lambda value: {"startup": {"warp": {"empty_cache_s": value, "full_cache_s": value}}},
+    "pipeline": lambda value: {"pipeline": {"steps": {"train": {"seconds": value}}}},
+}
+
+
+@pytest.mark.parametrize(
+    ("part", "old", "new", "verdict"),
+    [
+        ("growth", 1.0, 1.2, "slower"),
+        ("growth", 1.0, 1.05, "-"),
+        ("growth", 0.2, 0.05, "faster"),
+        ("threads", 2.0, 1.5, "slower"),
+        ("threads", 1.5, 2.0, "faster"),
+        ("threads", 2.0, 1.9, "-"),
+        ("startup", 1.0, 1.4, "slower"),
+        ("startup", 1.0, 1.2, "-"),
+        ("pipeline", 9.0, 5.0, "faster"),
+    ],
+)
+def test_what_has_one_value_in_a_run_is_compared_plainly(part, old, new, verdict):
+    runs = [{**run_of(), **OTHERS[part](value)} for value in (old, new)]
+    found = compare_runs(*runs)["others"]
+    assert len(found) == (2 if part == "startup" else 1)
+    for row in found:
+        assert (row["old"], row["new"], row["verdict"]) == (old, new, verdict)
 
 
 def test_a_target_is_met_or_not_by_the_best_backend():
@@ -572,6 +602,9 @@ def test_the_command_writes_a_record_and_compares_it(tmp_path, capfd, monkeypatc
     ended = mmmgpu("bench", "compare", out, out)
     assert ended.status == 0
     assert "drift of the machine 1" in ended.out
+    out.write_text(json.dumps(results | OTHERS["pipeline"](7)))
+    ended = mmmgpu("bench", "compare", out, out)
+    assert "pipeline [s]" in ended.out
 
 
 def test_a_pipeline_without_a_voice_is_said_and_left_out(monkeypatch):

@@ -109,11 +109,12 @@ def compare(
     """Show what became slower, or faster, beyond noise.
 
     How much the machine itself has changed is judged by other libraries and the reference, whose
-    code is the same: give --peers to both runs.
+    code is the same: give --peers to both runs. Growth, threads, starts and the pipeline have one
+    value each, and are compared plainly.
     """
     require_output(json, [old, new])
-    from mmmgpu.bench.comparison import compare_runs
-    from mmmgpu.bench.tables import compared_rows
+    from mmmgpu.bench.comparison import PLAIN, compare_runs
+    from mmmgpu.bench.tables import compared_others, compared_rows
 
     found = compare_runs(_read(old), _read(new))
     header = ("work", "by", "old [ms]", "new [ms]", "times, drift taken out", "verdict")
@@ -121,6 +122,10 @@ def compare(
     if not found["same_machine"]:
         said += "; NOT the same processor and threads"
     show_table(f"{found['old']} to {found['new']}; {said}", compared_rows(found), header)
+    header = ("what", "by", "old", "new", "times slower", "verdict")
+    said = f"One value each, no noise known: a change is more than {PLAIN:g} times"
+    if found["others"]:
+        show_table(said, compared_others(found), header)
     write_results(found, json)
 
 
