@@ -184,7 +184,7 @@ def pixels_near(places, height, width):
     x, y = np.moveaxis(places.astype(int), -1, 0)
     for corner in np.ndindex(2, 2):
         near[np.arange(len(places))[:, None], y + corner[0], x + corner[1]] = True
-    return np.count_nonzero(near)
+    return int(near.sum())
 
 
 CASES = (

@@ -71,7 +71,7 @@ def frames_of(name, basis, coordinates, shown, contenders, chained):
         unit="frame",
         part=1 / frames,
         checked=np.s_[:1],
-        whole=lambda: by_chain(basis, coordinates, shown, chained),
+        whole=partial(made_by_chain, basis, coordinates, shown, chained),
     )
 
 
@@ -93,7 +93,7 @@ class Chain(Reference):
         return k.to_host(k.fill_holes(*k.forward_warp(*map(k.to_device, (fields, flows))), hole))
 
 
-def by_chain(basis, coordinates, shown, name):
+def made_by_chain(basis, coordinates, shown, name):
     """All frames by the chain of operations that synthesis is one launch of."""
     prepared = prepare_synthesis(basis, shown=shown, backend="numpy")
     return np.stack(list(mouths(replace(prepared, kernels=Chain(name)), *coordinates)))
@@ -161,8 +161,13 @@ def analysis_work(backends, prototypes=PROTOTYPES, side=SIDE, frames=FRAMES):
         unit="frame",
         part=1 / frames,
         checked=np.s_[:1],
-        whole=analysis(basis, images, Chain(backends[0])).load(),
+        whole=partial(analyzed_by_chain, basis, images, backends[0]),
     )
+
+
+def analyzed_by_chain(basis, images, name):
+    """All frames by prototypes that single operations moved."""
+    return analysis(basis, images, Chain(name)).load()()
 
 
 def analysis(basis, images, kernels):
