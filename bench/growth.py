@@ -10,11 +10,12 @@ from functools import partial
 
 import numpy as np
 
+from mmmgpu.backends import get_backend
 from mmmgpu.bench import cases
 from mmmgpu.bench.drawn import drawn_basis, drawn_coordinates
 from mmmgpu.bench.kernels import on_backend
 from mmmgpu.bench.models import FPS, gdlr_work, matching_work, training_work, trajectory_work
-from mmmgpu.bench.pictures import analysis_work, synthesis
+from mmmgpu.bench.pictures import analysis, basis_and_mouths, synthesis
 from mmmgpu.bench.timing import timed
 
 
@@ -24,10 +25,9 @@ def pictures_of(name, prototypes=16, side=128, frames=4):
     return synthesis(drawn_basis(prototypes, side), coordinates, name).load()
 
 
-def analyses_of(name, prototypes=16, side=128, frames=4):
+def analyses_of(name, prototypes=16, side=128, frames=2):
     """Analysis of so many frames, to be timed."""
-    work = analysis_work([name], prototypes=prototypes, side=side, frames=frames)
-    return work.contenders[name].load()
+    return analysis(*basis_and_mouths(prototypes, side, frames), get_backend(name, 1)).load()
 
 
 def matching_of(name, frames):
@@ -95,7 +95,7 @@ AXES = {  # what grows, of which work: sizes, what is timed, what is counted
     ),
     "pixels, evaluate_rbf": (SIDES, operation(cases.rbf, *SIDE), square),
     "pictures, piecewise_warp": ((4, 16, 64), operation(cases.piecewise, "batch"), int),
-    "frames, matching scan": ((256, 512, 1024), matching_of, int),
+    "frames, matching scan": ((200, 400, 800), matching_of, int),
 }
 HOST = {  # the same of what no backend does
     "frames, trajectory": (LONG, solves(partial(trajectory_work, ()), "ours"), int),

@@ -146,10 +146,7 @@ def _read(field, places):
 
 def analysis_work(backends, prototypes=PROTOTYPES, side=SIDE, frames=FRAMES):
     """Mouths that are no prototypes, several at a time on one thread each."""
-    basis = drawn_basis(prototypes, side)
-    mouths = drawn_mouths(prototypes + frames, side)
-    known = {image.tobytes() for image in basis.images}
-    images = [image for image in mouths if image.tobytes() not in known][:frames]
+    basis, images = basis_and_mouths(prototypes, side, frames)
     pixels, products = int((basis.w_t > MOUTH).sum()), prototypes * (prototypes + 3) // 2
     return Work(
         f"analysis, {prototypes} prototypes of {side}x{side}",
@@ -163,6 +160,14 @@ def analysis_work(backends, prototypes=PROTOTYPES, side=SIDE, frames=FRAMES):
         checked=np.s_[:1],
         whole=partial(analyzed_by_chain, basis, images, backends[0]),
     )
+
+
+def basis_and_mouths(prototypes, side, frames):
+    """A basis, and mouths that are none of its prototypes."""
+    basis = drawn_basis(prototypes, side)
+    mouths = drawn_mouths(prototypes + frames, side)
+    known = {image.tobytes() for image in basis.images}
+    return basis, [image for image in mouths if image.tobytes() not in known][:frames]
 
 
 def analyzed_by_chain(basis, images, name):
