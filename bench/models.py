@@ -9,7 +9,7 @@ from mmmgpu.bench.cases import EVERY, smooth_flow
 from mmmgpu.bench.drawn import drawn_basis
 from mmmgpu.bench.timing import REFERENCE, Contender, Work
 from mmmgpu.correspondence import rbf_correspondence
-from mmmgpu.flow_matching import FlowScan, View
+from mmmgpu.flow_matching import DIRECTIONS, LEARNED, FlowScan, View
 from mmmgpu.gdlr import error_and_slope, extended, identity_regressions, regressed
 from mmmgpu.phonemes import PhonemeModels, segment_durations
 from mmmgpu.trajectories import (
@@ -50,13 +50,14 @@ def matching_work(backends, prototypes=46, frames=450, side=128):
         views = [View(map_, basis.flows[1:], some)]
         return FlowScan(basis, views, backend=name)().min(axis=0)
 
-    pixels = int((basis.w_f > 0.02).sum())
+    pixels, learned = int((basis.w_f > 0.02).sum()), min(frames, LEARNED)
+    directions = 4 * learned**2 + 4 * DIRECTIONS * (learned + prototypes + frames)
     return Work(
         f"matching scan, {prototypes} prototypes, {frames} frames of {side}x{side}",
         lambda: scan("numpy", flows[::EVERY]),
         {n: Contender(lambda n=n: lambda: scan(n, flows), tolerance=1e-5) for n in backends},
         bytes=frames * pixels * 2 * 4 * 3,
-        operations=prototypes * frames * pixels * 12 + frames * pixels * (22 + 4 * frames),
+        operations=pixels * (frames * (12 * prototypes + 22) + directions),
         items=frames,
         unit="frame",
         part=1 / EVERY,
