@@ -84,3 +84,10 @@ float16 pairs(const float16 left, const float16 right)
 {
     return (float16)(left.even + left.odd, right.even + right.odd);
 }
+
+float sum(const float16 v)
+{
+    const float8 a = v.lo + v.hi;
+    const float4 b = a.lo + a.hi;
+    return (b.s0 + b.s1) + (b.s2 + b.s3);
+}

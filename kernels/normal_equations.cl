@@ -14,18 +14,13 @@
 #define ROWS 4
 #define PRODUCTS (ROWS * ROWS)
 
-float sum(const float16 v)
-{
-    const float8 a = v.lo + v.hi;
-    const float4 b = a.lo + a.hi;
-    return (b.s0 + b.s1) + (b.s2 + b.s3);
-}
-
 __kernel void multiply(
-    __global const float *images, /* (M, S) */
+    __global const float *images, /* (M, stride) */
     __global const float *wanted, /* (S,) */
     const int number,             /* M */
+    const int stride,             /* values from one image to the next */
     const int size,               /* S */
+    const int before,             /* pieces that are multiplied already */
     const int first,
     const int count,
     /* outputs */
@@ -47,8 +42,8 @@ __kernel void multiply(
     for (int j = 0; j < ROWS; ++j) {
         const int r = ROWS * row + j;
         const int c = ROWS * column + j;
-        left[j] = r < number ? images + r * size : wanted;
-        right[j] = c < number ? images + c * size : wanted;
+        left[j] = r < number ? images + r * stride : wanted;
+        right[j] = c < number ? images + c * stride : wanted;
     }
     const int begin = piece * PIECE;
     const int end = begin + PIECE < size ? begin + PIECE : size;
@@ -66,7 +61,7 @@ __kernel void multiply(
         for (int j = 0; j < PRODUCTS; ++j)
             total[j] += a[j / ROWS] * b[j % ROWS];
     }
-    parts += piece * (number + 1) * number;
+    parts += (before + piece) * (number + 1) * number;
 #pragma unroll
     for (int j = 0; j < PRODUCTS; ++j) {
         const int r = ROWS * row + j / ROWS;

@@ -18,10 +18,10 @@ ROWS = wp.constant(4)  # of a block
 
 @wp.func
 def image_at(
-    images: wp.array[float], wanted: wp.array[float], r: int, number: int, size: int, start: int
+    images: wp.array[float], wanted: wp.array[float], r: int, number: int, stride: int, start: int
 ):
     """The address of an image, or of what is wanted, from value `start` on."""
-    image = address(images, wp.min(r, number - 1) * size + start)
+    image = address(images, wp.min(r, number - 1) * stride + start)
     return wp.where(r < number, image, address(wanted, start))
 
 
@@ -48,10 +48,12 @@ def store(
 
 @wp.kernel
 def multiply(
-    images: wp.array[float],  # (M, S)
+    images: wp.array[float],  # (M, stride)
     wanted: wp.array[float],  # (S,)
     number: int,  # M
+    stride: int,  # values from one image to the next
     size: int,  # S
+    before: int,  # pieces that are multiplied already
     first: int,
     count: int,
     # outputs
@@ -72,15 +74,15 @@ def multiply(
     length = wp.min(PIECE, size - begin)
     whole = length - length % LANES
     end = wp.uint64(4 * whole)
-    start = piece * (number + 1) * number
+    start = (before + piece) * (number + 1) * number
     r = ROWS * row
-    a0 = image_at(images, wanted, r, number, size, begin)
-    a1 = image_at(images, wanted, r + 1, number, size, begin)
-    a2 = image_at(images, wanted, r + 2, number, size, begin)
-    a3 = image_at(images, wanted, r + 3, number, size, begin)
+    a0 = image_at(images, wanted, r, number, stride, begin)
+    a1 = image_at(images, wanted, r + 1, number, stride, begin)
+    a2 = image_at(images, wanted, r + 2, number, stride, begin)
+    a3 = image_at(images, wanted, r + 3, number, stride, begin)
     for c in range(ROWS * column, wp.min(ROWS * column + ROWS, number), 2):
-        b0 = image_at(images, wanted, c, number, size, begin)
-        b1 = image_at(images, wanted, c + 1, number, size, begin)
+        b0 = image_at(images, wanted, c, number, stride, begin)
+        b1 = image_at(images, wanted, c + 1, number, stride, begin)
         total00 = vec16()
         total10 = vec16()
         total20 = vec16()

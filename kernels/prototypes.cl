@@ -10,6 +10,7 @@
 #include "orientation.cl"
 #include "pyramid.cl"
 #include "rings.cl"
+#include "carrying.cl"
 
 #define WHITE 65535.0f /* the brightest value of a texture */
 

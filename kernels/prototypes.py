@@ -8,6 +8,7 @@ padded to whole vectors; a padded row is a pitch.
 
 import warp as wp
 
+from mmmgpu.kernels.carrying import carry
 from mmmgpu.kernels.lanes import (
     LANES,
     get,
@@ -17,7 +18,7 @@ from mmmgpu.kernels.lanes import (
     vec16,
 )
 from mmmgpu.kernels.orientation import orient
-from mmmgpu.kernels.rings import COLOUR, MARGIN, carry
+from mmmgpu.kernels.rings import COLOUR, MARGIN
 
 wp.set_module_options({"enable_backward": False})
 

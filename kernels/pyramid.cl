@@ -35,13 +35,18 @@ float pull(__global const float *fine, const int step, const int h, const int w,
     return least_value(low);
 }
 
+/* Of a cell; the fourth is 1, or 0 where it is empty. */
 float4 mean(__global const float *cells, const int i, const int step)
 {
-    const float share = 1.0f / cells[i + 3 * step];
-    return share * (float4)(cells[i], cells[i + step], cells[i + 2 * step], 0.0f);
+    const float n = cells[i + 3 * step];
+    const float share = n > 0.0f ? 1.0f / n : 0.0f;
+    return share * (float4)(cells[i], cells[i + step], cells[i + 2 * step], n);
 }
 
-/* The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete. */
+/* The pixel (x, y) of a level of h x w, interpolated from four cells of the next one.
+ *
+ * The fourth is 1, or less where a cell is empty and the others are not known yet.
+ */
 float4 between(__global const float *coarse, const int h, const int w, const int y, const int x)
 {
     const int columns = (w + 1) / 2;

@@ -43,13 +43,18 @@ def pull(
 
 @wp.func
 def mean(cells: wp.array[float], i: int, step: int):
-    share = 1.0 / cells[i + 3 * step]
-    return wp.vec3(share * cells[i], share * cells[i + step], share * cells[i + 2 * step])
+    """Of a cell; the fourth is 1, or 0 where it is empty."""
+    n = cells[i + 3 * step]
+    share = wp.where(n > 0.0, 1.0 / n, 0.0)
+    return share * wp.vec4(cells[i], cells[i + step], cells[i + 2 * step], n)
 
 
 @wp.func
 def between(cells: wp.array[float], coarse: int, h: int, w: int, y: int, x: int):
-    """The pixel (x, y) of a level of h x w, interpolated from the next one, which is complete."""
+    """The pixel (x, y) of a level of h x w, interpolated from four cells of the next one.
+
+    The fourth is 1, or less where a cell is empty and the others are not known yet.
+    """
     columns = (w + 1) / 2
     rows = (h + 1) / 2
     across = pitch_of(columns)
@@ -64,7 +69,7 @@ def between(cells: wp.array[float], coarse: int, h: int, w: int, y: int, x: int)
 
 
 @wp.func
-def set_cell(cells: wp.array[float], i: int, step: int, colour: wp.vec3):
+def set_cell(cells: wp.array[float], i: int, step: int, colour: wp.vec4):
     """Give an empty cell a colour, and the weight of one pixel."""
     cells[i] = colour[0]
     cells[i + step] = colour[1]

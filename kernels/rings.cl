@@ -1,8 +1,7 @@
-/* Pictures splatted along a flow into sums of a ring of rows, and shown row by row.
+/* Pictures splatted along a flow into sums of a ring of rows.
  *
  * A pixel is added as two vectors of a pixel and the one right of it, in red, green, blue and weight.
- * A row of sums that no later pixel reaches is shown, and its place is free for another. Pixels that
- * received too little are listed, and filled by pull-push in the end.
+ * A row of sums that no later pixel reaches can be shown (carrying); then its place is free again.
  */
 
 #define APART 4       /* between pixels splatted in turn: neighbours would wait for each other */
@@ -92,107 +91,4 @@ void splat(const int pitch, __global const int *places, __global const float *st
             __global float8u *lower = (__global float8u *)(total + places[pitch + i]);
             *lower += both * steps[2 * pitch + i];
         }
-}
-
-/* Add to what is there, or begin it. */
-void add(__global float *out, const float16 v, const int begun)
-{
-    put(out, begun ? get(out) + v : v);
-}
-
-/* Add half of the sums over blocks of 2 x 2, or begin them. */
-void add_pairs(__global float *cell, const float16 v, const int more)
-{
-    const float8 sum = v.even + v.odd;
-    *(__global float8u *)cell = more ? *(__global float8u *)cell + sum : sum;
-}
-
-/* Add the means of row y to a picture that is `begun`, or begin it; begin the pyramid.
- *
- * Their sums are emptied. Pixels that are asked for and received too little go to the list of holes,
- * of which there are `found`. Returns how many there are then.
- */
-int show(__global float *total, const int y, const int h, const int w, const int pitch,
-         const float hole, const float weight, __global const float *scale, const int begun,
-         __global float *out, __global float *cells, __global int *holes, int found)
-{
-    const int area = h * pitch;
-    const int across = pitch_of((w + 1) / 2);
-    const int step = (h + 1) / 2 * across;
-    for (int x = 0; x < pitch; x += LANES) {
-        __global float *t = total + COLOUR * (x + LEFT);
-        const float16 a = get(t);
-        const float16 b = get(t + LANES);
-        const float16 c = get(t + 2 * LANES);
-        const float16 d = get(t + 3 * LANES);
-        for (int k = 0; k < COLOUR; ++k)
-            put(t + LANES * k, (float16)0.0f);
-        const float16 sum = (float16)(a.s37bf, b.s37bf, c.s37bf, d.s37bf);
-        const float16 share = share_of(x + LANE < w ? sum : (float16)0.0f, hole);
-        const float16 red = share * (float16)(a.s048c, b.s048c, c.s048c, d.s048c);
-        const float16 green = share * (float16)(a.s159d, b.s159d, c.s159d, d.s159d);
-        const float16 blue = share * (float16)(a.s26ae, b.s26ae, c.s26ae, d.s26ae);
-        const int i = y * pitch + x;
-        const float16 asked = get(scale + i);
-        const int16 lacks = share == 0.0f & asked > 0.0f;
-        if (least(lacks) < 0)
-            for (int j = 0; j < LANES; ++j)
-                if (lacks[j])
-                    holes[found++] = i + j;
-        const float16 part = weight * asked;
-        add(out + i, part * red, begun);
-        add(out + area + i, part * green, begun);
-        add(out + 2 * area + i, part * blue, begun);
-        __global float *cell = cells + y / 2 * across + x / 2;
-        add_pairs(cell, red, y % 2);
-        add_pairs(cell + step, green, y % 2);
-        add_pairs(cell + 2 * step, blue, y % 2);
-        add_pairs(cell + 3 * step, share > 0.0f ? (float16)1.0f : (float16)0.0f, y % 2);
-    }
-    return found;
-}
-
-/* Add to some pixels what is interpolated for them. */
-void mend(__global const int *holes, const int found, const int h, const int w, const int pitch,
-          const float weight, __global const float *scale, __global const float *cells,
-          __global float *out)
-{
-    for (int k = 0; k < found; ++k) {
-        const int i = holes[k];
-        const float4 colour = weight * scale[i] * between(cells, h, w, i / pitch, i % pitch);
-        out[i] += colour.x;
-        out[h * pitch + i] += colour.y;
-        out[2 * h * pitch + i] += colour.z;
-    }
-}
-
-/* Add a prototype, carried along a flow, to a picture that is `begun`, or begin it.
- *
- * Returns 0 where nothing of it arrives.
- */
-int carry(__global const ushort16 *texture, const int h, const int w, const int pitch,
-          __global const float *right, __global const float *down, const float hole,
-          const float weight, __global const float *scale, __global float *total,
-          __global float *cells, __global int *opens, __global int *places, __global float *steps,
-          __global int *holes, const int begun, __global float *out)
-{
-    const int ring = reach(down, h, pitch, opens);
-    int shown = 0;
-    int found = 0;
-    for (int y = 0; y <= h; ++y) {
-        for (; shown < opens[y]; ++shown)
-            found = show(total + (shown & (ring - 1)) * COLOUR * (pitch + MARGIN), shown, h, w,
-                         pitch, hole, weight, scale, begun, out, cells, holes, found);
-        if (y < h) {
-            aim(texture + COLOUR * y * pitch / LANES, y, h, w, pitch, right + y * pitch,
-                down + y * pitch, ring, places, steps);
-            splat(pitch, places, steps, total);
-        }
-    }
-    if (found == 0)
-        return 1;
-    if (fill(cells, (h + 1) / 2, (w + 1) / 2) == 0)
-        return 0;
-    mend(holes, found, h, w, pitch, weight, scale, cells, out);
-    return 1;
 }

@@ -160,10 +160,7 @@ def analyze(analyzer: Analyzer, image: F32) -> tuple[Floats, Floats]:
         beta, made = _fit_texture(analyzer, wanted, flow, used)
         alpha = _refine(analyzer, image, alpha, flow, made)
         used = np.flatnonzero(beta > NO_TEXTURE)
-    flow = analyzer.basis.flow(alpha)
-    every = np.arange(len(analyzer.thumbnails))
-    moved = _moved(analyzer, flow, every, analyzer.masked)
-    return alpha, _fit_beta(analyzer, wanted, moved, every, analyzer.masked)
+    return alpha, _fit_all(analyzer, wanted, analyzer.basis.flow(alpha))
 
 
 def _flow_to(analyzer: Analyzer, image: F32, nearest: int) -> F32:
@@ -224,28 +221,22 @@ def _fit_texture(
 ) -> tuple[Floats, F32]:
     """beta (M,), zero outside `used`, and the synthesis with it, (h, w, 3); `wanted` as planes."""
     k, scale = analyzer.kernels, analyzer.everywhere
-    moved = _moved(analyzer, flow, used, scale)
-    beta = _fit_beta(analyzer, wanted, moved, used, scale)
-    shares = k.to_device(beta[None, used].astype(np.float32))
-    mixed, width = k.to_host(k.blend(moved, shares))[0], flow.shape[1]
+    moved = k.move_prototypes(analyzer.held, k.to_device(planes(flow[None])), used, scale.held)
+    products = k.to_host(k.normal_equations(moved, k.to_device(wanted * scale.plane)))
+    shares = solve_simplex(products[:-1], products[-1])
+    mixed = k.to_host(k.blend(moved, k.to_device(shares[None].astype(np.float32))))[0]
+    beta, width = np.zeros(len(analyzer.thumbnails)), flow.shape[1]
+    beta[used] = shares
     return beta, picture(mixed[..., :width] / scale.plane[:, :width], width)
 
 
-def _moved(analyzer: Analyzer, flow: F32, used: NDArray[np.int64], scale: Scale) -> Any:
-    """On the device: the prototypes `used` (n,) along `flow`, scaled, (n, 3, h, pitch)."""
-    k = analyzer.kernels
-    return k.move_prototypes(analyzer.held, k.to_device(planes(flow[None])), used, scale.held)
-
-
-def _fit_beta(
-    analyzer: Analyzer, wanted: F32, moved: Any, used: NDArray[np.int64], scale: Scale
-) -> Floats:
-    """beta (M,), zero outside `used`; moved: what `_moved` gives for `scale`."""
-    k = analyzer.kernels
-    products = k.to_host(k.normal_equations(moved, k.to_device(wanted * scale.plane)))
-    beta = np.zeros(len(analyzer.thumbnails))
-    beta[used] = solve_simplex(products[:-1], products[-1])
-    return beta
+def _fit_all(analyzer: Analyzer, wanted: F32, flow: F32) -> Floats:
+    """beta (M,) of all prototypes, where the mask is; `wanted` as planes."""
+    k, scale = analyzer.kernels, analyzer.masked
+    every, image = np.arange(len(analyzer.thumbnails)), k.to_device(wanted * scale.plane)
+    found = k.prototype_equations(analyzer.held, planes(flow), every, image, scale.held)
+    products = k.to_host(found)
+    return solve_simplex(products[:-1], products[-1])
 
 
 def solve_simplex(gram: F32, right: F32) -> Floats:

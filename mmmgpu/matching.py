@@ -187,9 +187,9 @@ def _columns(images: F32, flows: F32, root: F32, mine: Numbers, kernels: Backend
     every, beta = np.arange(len(images)), np.zeros((len(images), len(mine)))
 
     def products(k: int, others: Numbers) -> F32:
-        flow, image = map(kernels.to_device, (planes(flows[k : k + 1]), wanted[k]))
-        moved = kernels.move_prototypes(held, flow, others, scale)
-        return kernels.to_host(kernels.normal_equations(moved, image))
+        image = kernels.to_device(wanted[k])
+        found = kernels.prototype_equations(held, planes(flows[k]), others, image, scale)
+        return kernels.to_host(found)
 
     for column, k in enumerate(mine):
         others = every[every != k]

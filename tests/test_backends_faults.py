@@ -259,7 +259,7 @@ def some_frames(synthesizer):
 
 def kept_by_this_thread(k):
     """Whether it is there, for how long: the scratch itself, not where it was kept."""
-    first = weakref.ref(k.scratch.of_this_thread().arrays[2][0])
+    first = weakref.ref(k.scratch.of_this_thread().arrays["mixtures"][2][0])
     assert first() is not None
     return lambda: first() is not None
 

@@ -44,7 +44,7 @@ LAYERS = {
 }
 DOMAIN = 2  # every other module
 SHARED = {
-    f"mmmgpu.kernels.{name}" for name in ("lanes", "orientation", "pyramid", "rings")
+    f"mmmgpu.kernels.{name}" for name in ("carrying", "lanes", "orientation", "pyramid", "rings")
 }  # functions
 
 

@@ -1,5 +1,6 @@
 """What every runtime makes of moved and mixed prototypes, against the reference."""
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from test_operations_equivalence import FLOWS, SIZES
 
 from mmmgpu.backends import get_backend
 from mmmgpu.backends.launches import GPU_WORKERS
+from mmmgpu.backends.moved_equations import BAND
 from mmmgpu.backends.planes import planes
 from mmmgpu.errors import InputError
 
@@ -39,6 +41,13 @@ def moved(name, images, flows, flow, used, scale, threads=None):
     to, how = map(k.to_device, (planes(flow[None]), planes(scale[..., None])[0]))
     made = k.to_host(k.move_prototypes(held, to, np.array(used, int), how))
     return np.moveaxis(made[..., : images.shape[2]], 1, -1)
+
+
+def equations(name, images, flows, flow, used, scale, wanted, threads=None):
+    k = get_backend(name, threads)
+    held = k.hold_prototypes(images, flows, HOLE)
+    image, how = map(k.to_device, (planes(wanted), planes(scale[..., None])[0]))
+    return k.to_host(k.prototype_equations(held, planes(flow), np.array(used, int), image, how))
 
 
 def mixed(name, *given, threads=None):
@@ -153,6 +162,8 @@ def test_nothing_asked_gives_nothing(backend, frames):
     seen = mixed(backend, images, flows, wanted, weights, scale)
     assert_array_equal(seen, np.zeros((frames, 5, 4, 3)))
     assert moved(backend, images, flows, flows[1], [], scale).shape == (0, 5, 4, 3)
+    for name in (backend, "numpy"):
+        assert equations(name, images, flows, flows[1], [], scale, images[0]).shape == (1, 0)
 
 
 def test_any_number_of_threads_gives_the_same_bits(backend):
@@ -162,6 +173,7 @@ def test_any_number_of_threads_gives_the_same_bits(backend):
     for run, given in (
         (mixed, (wanted, weights, scale)),
         (moved, (wanted[0], [0, 1, 2], scale)),
+        (equations, (wanted[0], [0, 1, 2], scale, images[0])),
     ):
         one, *others = (run(backend, images, flows, *given, threads=n) for n in (1, 2, 5))
         for other in others:
@@ -211,3 +223,68 @@ def test_a_prototype_that_leaves_the_picture_is_an_error(backend):
         moved(backend, images, flows, gone, [0], scale)
     with pytest.raises(InputError, match="no pixel"):
         mixed(backend, images, flows, np.stack([flows[0], gone]), np.ones((2, NUMBER)), scale)
+    with pytest.raises(InputError, match="no pixel"):
+        equations(backend, images, flows, gone, [0], scale, images[0])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (30, 16), (BAND + 1, 70), (2 * BAND, 40)])
+@pytest.mark.parametrize("own", KINDS)
+def test_equations_without_pictures_are_those_of_moved_pictures(backend, own, size):
+    images, flows = prototypes(own, size)
+    rng = np.random.default_rng(9)
+    flow, image = rng.uniform(-3, 3, (*size, 2)), rng.random((*size, 3), np.float32)
+    given = images, flows, flow.astype(np.float32), [2, 0, 1, 2], some_of(size, rng), image
+    try:
+        desired = equations("numpy", *given)
+    except InputError:
+        with pytest.raises(InputError):
+            equations(backend, *given)
+        return
+    assert_allclose(equations(backend, *given), desired, rtol=0, atol=1e-5 * desired.max())
+
+
+def test_equations_keep_no_picture(backend, monkeypatch):
+    """No array has room for the prototypes in all of their rows."""
+    k, size = replace(get_backend(backend)), (5 * BAND, 20)
+    images, flows = prototypes("tearing", size)
+    held = k.hold_prototypes(images, flows, HOLE)
+    image, how = map(k.to_device, (planes(images[0]), np.ones((size[0], 32), np.float32)))
+    empty, largest = type(k).empty, [0]
+
+    def counted(self, *shape, dtype=np.float32):
+        if dtype == np.float32:
+            largest[0] = max(largest[0], math.prod(shape))
+        return empty(self, *shape, dtype=dtype)
+
+    monkeypatch.setattr(type(k), "empty", counted)
+    k.prototype_equations(held, planes(0 * flows[1]), np.arange(NUMBER), image, how)
+    assert 0 < largest[0] < NUMBER * 3 * size[0] * 32
+
+
+@pytest.mark.parametrize("kind", ["mirrored", "torn"])
+def test_equations_begin_again_with_more_room_which_is_kept(backend, monkeypatch, kind):
+    """For rows of sums where rows arrive out of order, and for pixels that are set aside."""
+    k, size = replace(get_backend(backend)), (BAND - 1, 40)
+    x, y = np.meshgrid(*map(np.arange, size[::-1]))
+    down = {"mirrored": 46.2 - 2 * y, "torn": np.zeros(size)}[kind]
+    right = {"mirrored": np.zeros(size), "torn": np.where(x < 20, -19.5, 19.5)}[kind]
+    images, flows = prototypes("zero", size)
+    flow, used = np.stack([right, down], -1).astype(np.float32), np.arange(NUMBER)
+    held, scale = k.hold_prototypes(images, flows, HOLE), np.ones(size, np.float32)
+    image, how = map(k.to_device, (planes(images[0]), planes(scale[..., None])[0]))
+    launch_all, begun = type(k).launch_all, []
+
+    def counted(self, kernel, count, inputs, outputs):
+        begun.append(kernel == "prototype_equations.advance")
+        launch_all(self, kernel, count, inputs, outputs)
+
+    monkeypatch.setattr(type(k), "launch_all", counted)
+    found, runs = [], []
+    for _ in range(2):
+        found.append(k.to_host(k.prototype_equations(held, planes(flow), used, image, how)).copy())
+        runs.append(sum(begun))
+        begun.clear()
+    assert runs == [2, 1]
+    desired = equations("numpy", images, flows, flow, used, scale, images[0])
+    assert_allclose(found[0], desired, rtol=0, atol=1e-5 * desired.max())
+    assert_array_equal(found[1], found[0])

@@ -22,9 +22,9 @@ def test_what_a_thread_keeps_is_its_own_until_given_up():
     kept = scratch.of_this_thread()
     assert scratch.of_this_thread() is kept
     assert not scratch.give_up()
-    kept.arrays = 1, [], []
+    kept.arrays["sums"] = 1, [], []
     assert scratch.give_up()
-    assert kept.arrays is None
+    assert kept.arrays == {}
     assert not scratch.give_up()
 
 

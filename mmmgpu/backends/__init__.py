@@ -86,6 +86,14 @@ class Backend(Protocol):
         Where the scale is 0 nothing is filled.
         """
 
+    def prototype_equations(
+        self, held: Any, flow: F32, used: NDArray[np.int64], wanted: Any, scale: Any, /
+    ) -> Any:
+        """`normal_equations` of what `move_prototypes` gives, of which no picture is kept.
+
+        NumPy (2, H, P), NumPy (n,), (3, H, P), (H, P) -> (n + 1, n).
+        """
+
     def mix_prototypes(self, held: Any, flows: Any, weights: F32, scale: Any, /) -> Any:
         """CE05, Eq. 2, scaled: (B, 2, H, P), NumPy (B, M), (H, P) -> (B, 3, H, P).
 

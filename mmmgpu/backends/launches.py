@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mmmgpu.arrays import F32, check_some_valid
-from mmmgpu.backends.orientation import orient
-from mmmgpu.backends.planes import LANES, pitch_of
+from mmmgpu.arrays import check_some_valid
+from mmmgpu.backends.planes import LANES
 from mmmgpu.backends.scratch import Scratch
 from mmmgpu.errors import DeviceMemoryError
 
@@ -24,9 +23,6 @@ GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a t
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
 COLOURS = 3  # channels of a picture, as in kernels/sample
 RUN = 16  # points of a thread, as in kernels/sample
-WHITE = 65535  # of a texture, as in kernels/prototypes
-MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
-TOGETHER = 4, 2, 1  # mixtures whose flows are re-oriented at once: as many as there are enough of
 TILE = 64  # corpus rows packed at a time
 QUERIES, ROWS = 2, 4  # of one thread of kernels/distance_scan
 PIECE, BLOCK = 1024, 4  # values and rows of one thread of kernels/normal_equations
@@ -39,24 +35,6 @@ class Level:
     value: Any  # (B, h, w, C)
     weight: Any  # (B, h, w)
     threshold: float
-
-
-@dataclass(frozen=True)
-class Prototypes:
-    """Prototypes of height x width pixels on a device.
-
-    arrays: As the kernels of kernels/prototypes take them, from `images` to `row_shares`.
-    number, height, width: M and the size of a prototype.
-    nodes: See `mmmgpu.backends.orientation.Orientations`.
-    hole: Less weight makes a pixel a hole.
-    """
-
-    arrays: tuple[Any, ...]
-    number: int
-    height: int
-    width: int
-    nodes: int
-    hole: float
 
 
 @dataclass(frozen=True)
@@ -109,6 +87,19 @@ class Launches(ABC):
             if not self.scratch.give_up():
                 raise
         return allocate()
+
+    def kept(
+        self, purpose: str, number: int, shapes: list[tuple[tuple[int, ...], Any]]
+    ) -> list[Any]:
+        """Arrays (number or more, *shape), kept for a purpose and for this thread alone."""
+        mine = self.scratch.of_this_thread()
+        found = mine.arrays.get(purpose)
+        if found is None or found[0] < number or found[1] != shapes:
+            found = None
+            mine.arrays.pop(purpose, None)  # before more is asked for
+            arrays = [self.empty(number, *s, dtype=dtype) for s, dtype in shapes]
+            found = mine.arrays[purpose] = number, shapes, arrays
+        return found[2]
 
     def launch(
         self, kernel: str, first: int, count: int, inputs: list[Any], outputs: list[Any]
@@ -166,12 +157,27 @@ class Launches(ABC):
 
     def normal_equations(self, images: Any, wanted: Any) -> Any:
         number, size = images.shape[0], math.prod(images.shape[1:])
-        pieces, blocks = math.ceil(size / PIECE), number // BLOCK + 1
+        pieces = math.ceil(size / PIECE)
         parts = self.empty(pieces, number + 1, number)
-        products = self.empty(number + 1, number)
+        self.multiply(images, wanted, size, size, 0, parts)
+        return self.add_up(parts, pieces)
+
+    def multiply(
+        self, images: Any, wanted: Any, stride: int, size: int, before: int, parts: Any
+    ) -> int:
+        """Products of images of `size` values, after the first `before` parts: the next number."""
+        number = parts.shape[2]
+        pieces, blocks = math.ceil(size / PIECE), number // BLOCK + 1
         count = pieces * (blocks * (blocks + 1) // 2)
-        self.launch_all("normal_equations.multiply", count, [images, wanted, number, size], [parts])
-        inputs, count = [parts, pieces, number], (number + 1) * number
+        given = [images, wanted, number, stride, size, before]
+        self.launch_all("normal_equations.multiply", count, given, [parts])
+        return before + pieces
+
+    def add_up(self, parts: Any, pieces: int) -> Any:
+        """The first so many parts (pieces or more, M + 1, M), added up."""
+        _, rows, number = parts.shape
+        products = self.empty(rows, number)
+        inputs, count = [parts, pieces, number], rows * number
         self.launch_all("normal_equations.add_up", count, inputs, [products])
         return products
 
@@ -215,98 +221,6 @@ class Launches(ABC):
         inputs = [points, centres, weights, affine, number, terms, float(sharpness)]
         self.launch_all("rbf.evaluate_rbf", math.ceil(number / LANES), inputs, [mapped])
         return mapped
-
-    def hold_prototypes(self, images: F32, flows: F32, hole: float) -> Prototypes:
-        number, height, width, _ = images.shape
-        held = orient(flows, hole)
-        textures = np.ones((number, height, pitch_of(width), COLOURS + 1), np.uint16)
-        textures[:, :, :width, :COLOURS] = np.rint(images * WHITE)
-        parts = np.pad(held.flows.ravel(), LANES), held.shares, held.firsts, held.parts
-        rows = held.rows, held.targets, held.starts, held.row_taps, held.row_shares
-        arrays = tuple(self.to_device(a) for a in (textures, *parts, *rows))
-        return Prototypes(arrays, number, height, width, held.nodes, float(hole))
-
-    def move_prototypes(
-        self, held: Prototypes, flow: Any, used: NDArray[np.int64], scale: Any
-    ) -> Any:
-        alone = [np.arange(len(used) + 1), used, np.ones((len(used), 1))]
-        return self._mixtures(held, flow, len(used), alone, scale)
-
-    def mix_prototypes(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
-        mixtures, number = weights.shape
-        gpu = self.workers >= GPU_WORKERS
-        # on a CPU a mixture is one worker's, so that bits do not depend on the number of threads
-        shares = min(number, self.workers // max(mixtures, 1)) if gpu else 1
-        if shares <= 1:
-            return self._mix(held, flows, weights, scale)
-        which = np.arange(number) % shares == np.arange(shares)[:, None, None]
-        apart = np.where(which, weights, 0).reshape(-1, number)  # some prototypes a worker
-        mixed = self._mix(held, flows, apart, scale)
-        shape = mixtures, *mixed.shape[1:]
-        ones = self.to_device(np.ones((1, shares), np.float32))
-        whole = self.blend(self.reshaped(mixed, shares, math.prod(shape)), ones)
-        return self.reshaped(whole, *shape)
-
-    def _mix(self, held: Prototypes, flows: Any, weights: F32, scale: Any) -> Any:
-        mixtures, number = weights.shape
-        together = next(n for n in TOGETHER if n == 1 or mixtures >= n * self.workers)
-        groups = math.ceil(mixtures / together)
-        padded = np.zeros((groups, together, number), np.float32)
-        padded.reshape(-1, number)[:mixtures] = weights
-        used = padded.any(axis=1)
-        parts = np.concatenate([[0], np.cumsum(np.count_nonzero(used, axis=1))])
-        members = [parts, np.nonzero(used)[1], padded.transpose(0, 2, 1)[used]]
-        return self._mixtures(held, flows, mixtures, members, scale)
-
-    def _mixtures(
-        self,
-        held: Prototypes,
-        flows: Any,
-        mixtures: int,
-        members: list[Any],
-        scale: Any,
-    ) -> Any:
-        """Run kernels/prototypes with an accumulator for every worker.
-
-        Mixture b is along flow b, from the first again after the last.
-        """
-        height, pitch, together = held.height, pitch_of(held.width), members[2].shape[1]
-        if not mixtures:
-            return self.empty(0, 3, height, pitch)
-        workers = min(self.workers, len(members[0]) - 1)
-        size = _pyramid((height + 1) // 2, (held.width + 1) // 2)
-        ring = 1 << (height - 1).bit_length()
-        given = zip(members, (np.int32, np.int32, np.float32), strict=True)
-        shapes = [
-            ((ring, pitch + MARGIN, COLOURS + 1), np.float32),
-            ((COLOURS + 1, size), np.float32),
-            ((together, 2, height * pitch + LANES), np.float32),
-            ((together, 2, height * pitch + size), np.float32),  # at least as many as nodes
-            ((height + 1,), np.int32),
-            ((2, pitch), np.int32),
-            ((7, pitch), np.float32),
-            ((height, pitch), np.int32),
-        ]
-        mixed = self.empty(mixtures, 3, height, pitch)
-        arrived = self.empty(mixtures, dtype=np.int32)
-        inputs = [flows, *held.arrays, *(self.to_device(a.astype(t)) for a, t in given), scale]
-        inputs += [flows.shape[0], mixtures, together, height, held.width, size, ring, held.nodes]
-        inputs += [held.hole, workers]
-        # last: until here, all that is kept can be given up
-        scratch = self._scratch(workers, shapes)
-        self.launch_all("prototypes.mix_prototypes", workers, inputs, [*scratch, mixed, arrived])
-        check_some_valid(self.to_host(arrived))
-        return mixed
-
-    def _scratch(self, workers: int, shapes: list[Any]) -> list[Any]:
-        """Arrays (workers or more, *shape), of this thread alone."""
-        kept = self.scratch.of_this_thread()
-        found = kept.arrays
-        if found is None or found[0] < workers or found[1] != shapes:
-            found = kept.arrays = None  # before more is asked for
-            arrays = [self.empty(workers, *s, dtype=dtype) for s, dtype in shapes]
-            found = kept.arrays = workers, shapes, arrays
-        return found[2]
 
     def piecewise_warp(
         self, field: Any, vertices: Any, triangles: Any, index: Any, barycentric: Any
@@ -354,12 +268,3 @@ class Launches(ABC):
             rest = [fields, points, channels, whole]
             self.launch("distance_scan.pack", first, count, rest, [planes])
         return planes
-
-
-def _pyramid(height: int, width: int) -> int:
-    """Pixels of all levels of a picture, each half as high and wide, in padded rows."""
-    size = height * pitch_of(width)
-    while (height, width) != (1, 1):
-        height, width = (height + 1) // 2, (width + 1) // 2
-        size += height * pitch_of(width)
-    return size

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32
 from mmmgpu.backends.faults import device_failed, not_built, out_of_memory
-from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.launches import GPU_WORKERS
 from mmmgpu.backends.memory import KEPT, keep_freed_memory, use_huge_pages
+from mmmgpu.backends.prototype_launches import PrototypeLaunches
 from mmmgpu.backends.warp_cache import load, own_folder
 from mmmgpu.errors import InputError
 
@@ -111,7 +112,7 @@ def _failed_builds(stem: str, device: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Warp(Launches):
+class Warp(PrototypeLaunches):
     """Device arrays are `wp.array` of scalars."""
 
     device: str

@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from mmmgpu.arrays import F32
 from mmmgpu.backends import default_threads
 from mmmgpu.backends.faults import device_failed, not_built, out_of_memory, out_of_resources
-from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.launches import GPU_WORKERS
 from mmmgpu.backends.memory import keep_freed_memory
 from mmmgpu.backends.opencl_memory import Array, OwnMemory, SharedMemory
 from mmmgpu.backends.pocl_cache import cache_variables
 from mmmgpu.backends.pocl_cpu import name_unknown_cpu
+from mmmgpu.backends.prototype_launches import PrototypeLaunches
 from mmmgpu.errors import InputError
 
 LOCAL = 16  # work-items of a group; 1 where there are fewer than `GROUPS` for each thread
@@ -153,7 +154,7 @@ def _faults_of(device: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class OpenCL(Launches):
+class OpenCL(PrototypeLaunches):
     """Device arrays are `Array`."""
 
     name: str  # for `get_backend`

@@ -106,6 +106,12 @@ class Reference:
             moved[j] = self._filled_warp(held.images[i : i + 1], oriented, held.hole)[0]
         return np.asarray(planes(moved) * scale, np.float32)
 
+    def prototype_equations(
+        self, held: Prototypes, flow: F32, used: NDArray[np.int64], wanted: F32, scale: F32
+    ) -> F32:
+        moved = self.move_prototypes(held, flow[None], used, scale)
+        return self.normal_equations(moved, wanted)
+
     def mix_prototypes(self, held: Prototypes, flows: F32, weights: F32, scale: F32) -> F32:
         mixed = np.zeros((len(flows), 3, *scale.shape), np.float32)
         for b, (flow, share) in enumerate(zip(flows, weights, strict=True)):

@@ -1,7 +1,7 @@
 """Scratch of the workers, which each thread of the host keeps until memory is short."""
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakSet
 
@@ -10,10 +10,10 @@ from weakref import WeakSet
 class Kept:
     """The scratch of one thread of the host; any other may take it away.
 
-    arrays: None, or how many workers they are for, their shapes, and the arrays.
+    arrays: By what they are for: how many there are, their shapes, and the arrays.
     """
 
-    arrays: tuple[int, list[Any], list[Any]] | None = None
+    arrays: dict[str, tuple[int, list[Any], list[Any]]] = field(default_factory=dict)
 
 
 class Scratch:
@@ -40,5 +40,5 @@ class Scratch:
         with self._changing:
             holding = [kept for kept in self._all if kept.arrays]
         for kept in holding:
-            kept.arrays = None
+            kept.arrays = {}
         return bool(holding)
