@@ -1,7 +1,7 @@
 """NVIDIA Warp runtime (kernels/*.py) on all CPU cores or on one CUDA device.
 
 A Warp launch on the CPU is one serial loop that releases the GIL, so the items of an operation are
-cut into one contiguous part a thread. No two parts ever write to one place.
+cut into one contiguous part a thread. No two parts ever write different values to one place.
 """
 
 import functools
