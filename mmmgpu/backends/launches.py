@@ -196,15 +196,17 @@ class Launches(ABC):
     def distance_scan(self, queries: Any, corpus: Any, weights: Any) -> Any:
         number, points, channels = queries.shape
         rows = corpus.shape[0]
-        packed = self._packed(queries, points, channels, 0, number)
-        shares = self._packed(weights, points, 1, 0, 1)
+        packed = self._packed(queries, points, channels, number)
+        shares = self._packed(weights, points, 1, 1)
         distance = self.empty(number, rows)
         groups = math.ceil(number / QUERIES)
 
         def scan(first: int, count: int) -> None:
+            # the same for all tiles, which may be queued long before the first of them is scanned
+            planes = self._planes(points, channels, min(TILE, count))
             for start in range(first, first + count, TILE):
                 tile = min(TILE, first + count - start)
-                planes = self._packed(corpus, points, channels, start, tile)
+                self._pack(corpus, points, channels, start, tile, planes)
                 sizes = [number, rows, start, tile, math.ceil(points / LANES), channels]
                 inputs = [packed, planes, shares, *sizes]
                 blocks = groups * math.ceil(tile / ROWS)
@@ -258,13 +260,22 @@ class Launches(ABC):
             inputs = [holes, fine.weight, coarse.value, fine.threshold, *fine.value.shape[1:]]
             self.launch("fill_holes.push", first * rows, count * rows, inputs, [fine.value])
 
-    def _packed(self, fields: Any, points: int, channels: int, first: int, count: int) -> Any:
-        """Rows of `fields` (N, P, C) as padded planes, shape (count, C, V * 16)."""
-        planes = self.empty(count, channels, math.ceil(points / LANES) * LANES)
+    def _planes(self, points: int, channels: int, count: int) -> Any:
+        """Uninitialised planes, shape (count, C, V * 16)."""
+        return self.empty(count, channels, math.ceil(points / LANES) * LANES)
+
+    def _packed(self, fields: Any, points: int, channels: int, count: int) -> Any:
+        """The first rows of `fields` (N, P, C) as padded planes."""
+        planes = self._planes(points, channels, count)
+        self._pack(fields, points, channels, 0, count, planes)
+        return planes
+
+    def _pack(
+        self, fields: Any, points: int, channels: int, first: int, count: int, planes: Any
+    ) -> None:
         whole = points - points % LANES if channels == 2 else 0
         if whole:
             self.launch("distance_scan.pack_flows", first, count, [fields, points], [planes])
         if whole < points:
             rest = [fields, points, channels, whole]
             self.launch("distance_scan.pack", first, count, rest, [planes])
-        return planes
