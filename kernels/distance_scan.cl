@@ -2,15 +2,16 @@
  *
  * `pack` lays the channels of each field out as planes padded to whole vectors; `distance_scan`
  * walks them 16 points at a time, in float within a block and in double from block to block. Two
- * queries and four rows of the corpus share their loads. The processor's unit for roots works beside
- * those for sums and products: it gets the first eight of 16 points, `root` has the others.
+ * queries and four rows of the corpus share their loads. The processor's roots of 16 points take as
+ * long as all else: with AVX-512 it estimates 1/sqrt instead, else `root` has half of them.
  */
 
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
 #define LANES 16
 #define MAGIC 0x5f200000
-#define BLOCK 16 /* vectors summed in float */
+#define TINY 1.2e-38f /* added to squares, so that they have a 1/sqrt */
+#define BLOCK 64 /* vectors summed in float */
 #define QUERIES 2
 #define ROWS 4
 #define PAIRS (QUERIES * ROWS)
@@ -63,14 +64,28 @@ __kernel void pack_flows(
     }
 }
 
+#ifdef __AVX512F__
+
+/* part + w sqrt(x), x > 0, within 2e-7: y is 1/sqrt(x) within 6e-5, of which Newton's step makes
+ * sqrt(x) = xy (3 - xyy) / 2.
+ */
+float16 add_root(const float16 part, const float16 w, const float16 x)
+{
+    const float16 y = __builtin_ia32_rsqrt14ps512_mask(x, x, (ushort)-1);
+    const float16 xy = x * y;
+    return part + 0.5f * w * (xy * (3.0f - xy * y));
+}
+
+#else
+
 /* sqrt(x), within 8e-7 of it: xy / sqrt(xyy), where y is 1/sqrt(x) by its bits and
  * 0.75 < xyy < 0.844.
  */
-float16 root(const float16 x)
+float8 root(const float8 x)
 {
-    const float16 y = as_float16(MAGIC - (as_int16(x) >> 1));
-    const float16 xy = x * y;
-    const float16 t = xy * y;
+    const float8 y = as_float8(MAGIC - (as_int8(x) >> 1));
+    const float8 xy = x * y;
+    const float8 t = xy * y;
     return xy * (2.45213665f + t * (-3.07998830f + t * (2.31981536f + t * -0.692957570f)));
 }
 
@@ -81,7 +96,7 @@ float16 root(const float16 x)
 #endif
 
 /* The same by the processor. As functions of single numbers the compiler makes vectors of them; PoCL
- * 3.0 calls its own for vectors, and aborts the process where they have 16.
+ * 3.0 calls its own for vectors.
  */
 float8 exact_root(const float8 x)
 {
@@ -89,6 +104,14 @@ float8 exact_root(const float8 x)
         ROOT(x.s0), ROOT(x.s1), ROOT(x.s2), ROOT(x.s3), ROOT(x.s4), ROOT(x.s5), ROOT(x.s6),
         ROOT(x.s7));
 }
+
+/* part + w sqrt(x). The unit for roots works beside those for sums and products: half by each. */
+float16 add_root(const float16 part, const float16 w, const float16 x)
+{
+    return part + w * (float16)(exact_root(x.lo), root(x.hi));
+}
+
+#endif
 
 double sum(const float8 part)
 {
@@ -124,34 +147,31 @@ __kernel void distance_scan(
 #pragma unroll
     for (int j = 0; j < ROWS; ++j)
         n[j] = min(ROWS * ((first + tid) / groups) + j, tile - 1);
-    double total[PAIRS] = {0.0};
+    double total[PAIRS + 1] = {0.0}; /* the last is of equal fields, where TINY is all there is */
     for (int begin = 0; begin < vectors; begin += BLOCK) {
         const int end = begin + BLOCK < vectors ? begin + BLOCK : vectors;
-        float16 part[PAIRS] = {(float16)(0.0f)}; /* of two pairs: the first eight points, the others */
+        float16 part[PAIRS + 1] = {(float16)(0.0f)};
         for (int v = begin; v < end; ++v) {
-            float16 norm[PAIRS] = {(float16)(0.0f)};
+            float16 norm[PAIRS + 1];
+#pragma unroll
+            for (int j = 0; j <= PAIRS; ++j)
+                norm[j] = (float16)(TINY);
             for (int i = v; i < row; i += vectors)
 #pragma unroll
                 for (int j = 0; j < PAIRS; ++j) {
                     const float16 d = queries[k[j / ROWS] * row + i] - planes[n[j % ROWS] * row + i];
                     norm[j] += d * d;
                 }
-            const float16 w = weights[v];
 #pragma unroll
-            for (int j = 0; j < PAIRS; j += 2) {
-                const float16 exact = (float16)(exact_root(norm[j].lo), exact_root(norm[j + 1].lo));
-                part[j] += (float16)(w.lo, w.lo) * exact;
-                part[j + 1] += (float16)(w.hi, w.hi) * root((float16)(norm[j].hi, norm[j + 1].hi));
-            }
+            for (int j = 0; j <= PAIRS; ++j)
+                part[j] = add_root(part[j], weights[v], norm[j]);
         }
 #pragma unroll
-        for (int j = 0; j < PAIRS; j += 2) {
-            const float16 both = part[j] + part[j + 1];
-            total[j] += sum(both.lo);
-            total[j + 1] += sum(both.hi);
-        }
+        for (int j = 0; j <= PAIRS; ++j)
+            total[j] += sum(part[j].lo + part[j].hi);
     }
 #pragma unroll
     for (int j = 0; j < PAIRS; ++j)
-        distance[k[j / ROWS] * corpus + start + n[j % ROWS]] = (float)total[j];
+        distance[k[j / ROWS] * corpus + start + n[j % ROWS]] =
+            total[j] == total[PAIRS] ? 0.0f : (float)total[j];
 }
