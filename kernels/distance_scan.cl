@@ -8,6 +8,10 @@
 
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
+#ifndef __has_builtin
+#define __has_builtin(name) 0
+#endif
+
 #define LANES 16
 #define MAGIC 0x5f200000
 #define TINY 1.2e-38f /* added to squares, so that they have a 1/sqrt */
@@ -64,7 +68,7 @@ __kernel void pack_flows(
     }
 }
 
-#ifdef __AVX512F__
+#if defined(__AVX512F__) && __has_builtin(__builtin_ia32_rsqrt14ps512_mask)
 
 /* part + w sqrt(x), x > 0, within 2e-7: y is 1/sqrt(x) within 6e-5, of which Newton's step makes
  * sqrt(x) = xy (3 - xyy) / 2.
