@@ -98,8 +98,10 @@ def advance(
         )
         needed = reach(residual, missing + nodes, height, pitch, opens, open)
         states[p] = wp.vec4i(needed, 0, 0, 0)
-        for y in range(1, 4 * ((height + 1) / 2) + 1):  # what pads the rows of the first level
-            put(cells, cell + y * across - LANES, vec16())
+        for i in range(
+            0, 4 * ((height + 1) / 2) * across, LANES
+        ):  # the first level: 0 times NaN is NaN
+            put(cells, cell + i, vec16())
     before = states[p]
     found = before[3]
     if before[0] > ring:  # the host will make more room

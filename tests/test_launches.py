@@ -261,6 +261,24 @@ def test_equations_keep_no_picture(backend, monkeypatch):
     assert 0 < largest[0] < NUMBER * 3 * size[0] * 32
 
 
+@pytest.mark.parametrize("run", [moved, equations])
+@pytest.mark.parametrize("kind", ["constant", "tearing"])
+def test_no_scratch_of_prototypes_is_read_before_it_is_written(backend, run, kind, monkeypatch):
+    size = 33, 70
+    images, flows = prototypes(kind, size)
+    given = images, flows, flows[2], [0, 1, 2], np.ones(size, np.float32), images[0]
+    given = given if run is equations else given[:-1]
+    clean = run(backend, *given)
+
+    def poisoned(self, *shape, dtype=np.float32):
+        return self.to_device(np.full(shape, np.nan if dtype == np.float32 else 1 << 28, dtype))
+
+    k = get_backend(backend, None)  # that of the runs
+    assert k.scratch.give_up()
+    monkeypatch.setattr(type(k), "empty", poisoned)
+    assert_array_equal(run(backend, *given), clean)
+
+
 @pytest.mark.parametrize("kind", ["mirrored", "torn"])
 def test_equations_begin_again_with_more_room_which_is_kept(backend, monkeypatch, kind):
     """For rows of sums where rows arrive out of order, and for pixels that are set aside."""
