@@ -125,10 +125,14 @@ def orient(
                     y += missing(field, at + area, share, qy)
                 put(residual, to + 2 * f * nodes, wp.cw_mul(total, x))
                 put(residual, to + (2 * f + 1) * nodes, wp.cw_mul(total, y))
-    for plane in range(2 * together):
-        at = here + plane * nodes
+    for f in range(together):
+        x_at = here + 2 * f * nodes
+        y_at = x_at + nodes
         for row in range(rows[m], rows[m + 1]):
-            sum = float(0.0)
+            across = float(0.0)
+            along = float(0.0)
             for j in range(starts[row], starts[row + 1]):
-                sum += row_shares[j] * residual[at + row_taps[j]]
-            residual[at + targets[row]] = sum
+                across += row_shares[j] * residual[x_at + row_taps[j]]
+                along += row_shares[j] * residual[y_at + row_taps[j]]
+            residual[x_at + targets[row]] = across
+            residual[y_at + targets[row]] = along
