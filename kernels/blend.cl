@@ -1,4 +1,4 @@
-/* Weighted sums of images: 16 values a work-item, then what is left over.
+/* Weighted sums of images: 16 values of one result or of four a work-item, then what is left over.
  *
  * Eight terms at a time in float, which leaves at most eight roundings of theirs, and those sums in
  * double, for any number of images. PoCL 3.0 calls its own vload and conversions as functions.
@@ -8,6 +8,7 @@
 
 #define LANES 16
 #define BLOCK 8 /* terms summed in float */
+#define TOGETHER 4 /* results for which each image is read once */
 
 /* A vector anywhere in an image. */
 typedef float float16u __attribute__((ext_vector_type(16), aligned(4)));
@@ -20,6 +21,20 @@ double4 wide(const float4 x)
 float4 narrow(const double4 x)
 {
     return (float4)(x.s0, x.s1, x.s2, x.s3);
+}
+
+void add(double4 *total, const float16 part)
+{
+    total[0] += wide(part.s0123);
+    total[1] += wide(part.s4567);
+    total[2] += wide(part.s89ab);
+    total[3] += wide(part.scdef);
+}
+
+void put(__global float *p, const double4 *total)
+{
+    *(__global float16u *)p = (float16)(
+        narrow(total[0]), narrow(total[1]), narrow(total[2]), narrow(total[3]));
 }
 
 __kernel void blend(
@@ -44,13 +59,55 @@ __kernel void blend(
         float16 part = (float16)(0.0f);
         for (int m = begin; m < end; ++m)
             part += weights[b * number + m] * *(__global const float16u *)(images + m * size + start);
-        total[0] += wide(part.s0123);
-        total[1] += wide(part.s4567);
-        total[2] += wide(part.s89ab);
-        total[3] += wide(part.scdef);
+        add(total, part);
     }
-    *(__global float16u *)(blended + b * size + start) = (float16)(
-        narrow(total[0]), narrow(total[1]), narrow(total[2]), narrow(total[3]));
+    put(blended + b * size + start, total);
+}
+
+__kernel void blend_together(
+    __global const float *restrict images,   /* (M, S) */
+    __global const float *restrict weights,  /* (batch, M) */
+    const int number,                        /* M */
+    const int size,                          /* S */
+    const int batch,
+    const int first,
+    const int count,
+    /* outputs */
+    __global float *restrict blended)        /* (batch, S), the whole vectors of each row are written */
+{
+    const int tid = get_global_id(0);
+    if (tid >= count)
+        return;
+    const int vectors = size / LANES;
+    const int start = (first + tid) % vectors * LANES;
+    int b[TOGETHER]; /* the last one again, where there are fewer */
+    double4 total[TOGETHER][LANES / 4];
+#pragma unroll
+    for (int r = 0; r < TOGETHER; ++r) {
+        const int row = (first + tid) / vectors * TOGETHER + r;
+        b[r] = row < batch ? row : batch - 1;
+        for (int k = 0; k < LANES / 4; ++k)
+            total[r][k] = (double4)(0.0);
+    }
+    for (int begin = 0; begin < number; begin += BLOCK) {
+        const int end = begin + BLOCK < number ? begin + BLOCK : number;
+        float16 part[TOGETHER];
+#pragma unroll
+        for (int r = 0; r < TOGETHER; ++r)
+            part[r] = (float16)(0.0f);
+        for (int m = begin; m < end; ++m) {
+            const float16 values = *(__global const float16u *)(images + m * size + start);
+#pragma unroll
+            for (int r = 0; r < TOGETHER; ++r)
+                part[r] += weights[b[r] * number + m] * values;
+        }
+#pragma unroll
+        for (int r = 0; r < TOGETHER; ++r)
+            add(total[r], part[r]);
+    }
+#pragma unroll
+    for (int r = 0; r < TOGETHER; ++r)
+        put(blended + b[r] * size + start, total[r]);
 }
 
 __kernel void blend_rest(

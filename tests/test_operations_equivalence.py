@@ -190,6 +190,16 @@ def test_blend(backend, size, number):
     assert_close(actual, operations.blend(images, weights, backend="numpy"))
 
 
+@pytest.mark.parametrize("results", [2, 3, 4, 5, 9])
+def test_results_that_are_blended_together_are_the_bits_of_each_alone(backend, results):
+    rng = np.random.default_rng(results)
+    images = rng.normal(0, 1, (13, 7, 11, 3)).astype(np.float32)
+    weights = rng.normal(0, 1, (results, 13))
+    together = operations.blend(images, weights, backend=backend)
+    alone = [operations.blend(images, w, backend=backend) for w in weights]
+    assert_array_equal(together, np.reshape(alone, together.shape))
+
+
 def test_blend_of_many_images_whose_sum_grows_large_and_cancels(backend):
     rng = np.random.default_rng(0)
     images = rng.uniform(1, 2, (20_000, 5, 9, 3)).astype(np.float32)

@@ -23,6 +23,7 @@ GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a t
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
 COLOURS = 3  # channels of a picture, as in kernels/sample
 RUN = 16  # points of a thread, as in kernels/sample
+BLENDED = 4  # results of one thread, as in kernels/blend
 TILE = 64  # corpus rows packed at a time
 QUERIES, ROWS = 2, 4  # of one thread of kernels/distance_scan
 PIECE, BLOCK = 1024, 4  # values and rows of one thread of kernels/normal_equations
@@ -151,7 +152,12 @@ class Launches(ABC):
         size = math.prod(shape)
         blended = self.empty(batch, *shape)
         inputs = [images, weights, number, size]
-        self.launch_all("blend.blend", batch * (size // LANES), inputs, [blended])
+        vectors = size // LANES
+        if batch == 1:
+            self.launch_all("blend.blend", vectors, inputs, [blended])
+        else:
+            count = math.ceil(batch / BLENDED) * vectors
+            self.launch_all("blend.blend_together", count, [*inputs, batch], [blended])
         self.launch_all("blend.blend_rest", batch * (size % LANES), inputs, [blended])
         return blended
 
