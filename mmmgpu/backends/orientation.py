@@ -190,7 +190,7 @@ def _filling(valid: NDArray[np.bool_]) -> tuple[_Rows, _Rows]:
         by = (top[k] + down) * w + left[k] + right
         full = number[by] > 0
         k, down, right, by = k[full], down[full], right[full], by[full]
-        used = np.unique(by)
+        used = np.flatnonzero(np.bincount(by))  # `np.unique` would load masked arrays: 0.02 s
         place = np.full(h * w, -1)
         place[used] = np.arange(count, count + len(used))
         count += len(used)
