@@ -32,7 +32,7 @@ images = rng.random((8, 96, 96, 3), dtype=np.float32)
 flows = rng.normal(0, 1, (8, 1, 1, 2)).astype(np.float32) * np.ones((96, 96, 1), np.float32)
 basis = make_basis(images, flows, 0, region_from_box((0, 0, 96, 96), (96, 96)))
 alpha, beta = np.full((1, 7), 0.1), np.full((1, 8), 0.125)
-print(next(synthesize(basis, alpha, beta, backend=sys.argv[1])).mean())
+print(next(synthesize(basis, alpha, beta, backend=sys.argv[1])).mean(), flush=True)
 """
 
 
@@ -58,23 +58,39 @@ def measure_startup(backends, *, turns=3):
 def first_frame(backend, cache):
     """Seconds that a new process takes to its first frame, with kernels cached in that folder."""
     start = time.perf_counter()
-    run_new("-c", FIRST_FRAME, backend, cache=cache)
-    return time.perf_counter() - start
+    with begun("-c", FIRST_FRAME, backend, cache=cache) as process:
+        process.stdout.readline()
+        taken = time.perf_counter() - start
+        finish(process)
+    return taken
 
 
 def run_new(*arguments, cache):
-    """What a new process prints that keeps its kernels in that folder.
+    """What a new process prints that keeps its kernels in that folder."""
+    with begun(*arguments, cache=cache) as process:
+        return finish(process)
+
+
+def begun(*arguments, cache):
+    """A new process that keeps its kernels in that folder."""
+    environment = os.environ | {"WARP_CACHE_PATH": cache, "XDG_CACHE_HOME": cache}
+    call = [sys.executable, *arguments]
+    return subprocess.Popen(
+        call, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def finish(process):
+    """What else it prints.
 
     Raises:
         InputError: It failed.
     """
-    environment = os.environ | {"WARP_CACHE_PATH": cache, "XDG_CACHE_HOME": cache}
-    call = [sys.executable, *arguments]
-    done = subprocess.run(call, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        said = done.stderr.strip().splitlines()[-1]
-        raise InputError(f"no first frame on {arguments[-1]}: {said}")
-    return done.stdout
+    printed, errors = process.communicate()
+    if process.returncode:
+        said = errors.strip().splitlines()[-1]
+        raise InputError(f"no first frame on {process.args[-1]}: {said}")
+    return printed
 
 
 def compile_all(backend):

@@ -127,6 +127,26 @@ def test_garbage_is_looked_for_again_once_a_backend_is_imported(monkeypatch, tmp
     assert gc.isenabled()
 
 
+def test_what_a_backend_imports_is_old(monkeypatch, tmp_path):
+    """The next searches for garbage pass it by, and what others froze stays frozen."""
+    source = "made = [[] for _ in range(1000)]\ndef list_devices():\n    return {}\n"
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("old_backend", "old_backend_where_something_is_frozen"):
+        (tmp_path / f"{name}.py").write_text(source)
+        monkeypatch.setitem(BACKENDS, name, name)
+    list_devices("old_backend")
+    young = [*gc.get_objects(generation=0), *gc.get_objects(generation=1)]
+    assert not any(known is sys.modules["old_backend"].made for known in young)
+    assert gc.get_freeze_count() == 0
+    gc.freeze()
+    try:
+        frozen = gc.get_freeze_count()
+        list_devices("old_backend_where_something_is_frozen")
+        assert gc.get_freeze_count() > frozen / 2
+    finally:
+        gc.unfreeze()
+
+
 def test_a_library_that_is_missing_says_what_to_install(monkeypatch):
     monkeypatch.setitem(backends.BACKENDS, "absent", "mmmgpu_no_such_module")
     with pytest.raises(InputError, match=r"needs 'mmmgpu_no_such_module'.*pip install"):

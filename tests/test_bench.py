@@ -555,6 +555,13 @@ def test_all_operations_are_compiled_in_a_new_process(monkeypatch):
     assert found.keys() == {*operations, "mix_prototypes"}
 
 
+def test_a_first_frame_is_there_before_its_process_ends(monkeypatch, tmp_path):
+    lasting = "import time\nprint(1, flush=True)\ntime.sleep(3)"
+    monkeypatch.setattr(startup, "FIRST_FRAME", lasting)
+    start = time.perf_counter()
+    assert startup.first_frame("numpy", str(tmp_path)) < time.perf_counter() - start - 2
+
+
 def test_a_first_frame_that_fails_says_why(tmp_path):
     assert startup.first_frame("numpy", str(tmp_path)) > 0.1
     with pytest.raises(InputError, match=r"no first frame on warp:cuda:99: .*there is no device"):

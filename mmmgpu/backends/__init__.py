@@ -151,12 +151,18 @@ def _module(family: str) -> Any:
 
 @contextmanager
 def _nothing_collected() -> Iterator[None]:
-    """No search for garbage: what an import makes stays, and looking through it takes a tenth."""
+    """No search for garbage: what an import makes stays, and looking through it takes a tenth.
+
+    It counts as old afterwards, where the next searches do not look.
+    """
     was_on = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
+        if not gc.get_freeze_count():  # else what others froze would be freed
+            gc.freeze()
+            gc.unfreeze()
         if was_on:
             gc.enable()
 
