@@ -71,7 +71,10 @@ def add(out: wp.array[float], i: int, v: vec16):
 
 @wp.func
 def add_pairs(cells: wp.array[float], i: int, v: vec16, more: float):
-    """Add half of the sums over blocks of 2 x 2 (`more` is 1), or begin them (0)."""
+    """Add half of the sums over blocks of 2 x 2 (`more` is 1), or begin them (0).
+
+    No NaN must be where they begin: it would stay.
+    """
     sum = vec8()
     for j in range(HALF):
         sum[j] = v[2 * j] + v[2 * j + 1]

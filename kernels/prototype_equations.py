@@ -98,9 +98,7 @@ def advance(
         )
         needed = reach(residual, missing + nodes, height, pitch, opens, open)
         states[p] = wp.vec4i(needed, 0, 0, 0)
-        for i in range(
-            0, 4 * ((height + 1) / 2) * across, LANES
-        ):  # the first level: 0 times NaN is NaN
+        for i in range(0, 4 * ((height + 1) / 2) * across, LANES):  # the first level; see add_pairs
             put(cells, cell + i, vec16())
     before = states[p]
     found = before[3]

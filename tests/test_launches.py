@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
@@ -240,6 +241,30 @@ def test_equations_without_pictures_are_those_of_moved_pictures(backend, own, si
         with pytest.raises(InputError):
             equations(backend, *given)
         return
+    assert_allclose(equations(backend, *given), desired, rtol=0, atol=1e-5 * desired.max())
+
+
+def test_equations_read_nothing_that_is_not_written_before(backend, monkeypatch):
+    """Memory holds anything at first, such as NaN and numbers beyond every array."""
+    images, flows = prototypes("random", (2 * BAND, 40))
+    scale = some_of((2 * BAND, 40), np.random.default_rng(10))
+    given = images, flows, flows[1], range(NUMBER), scale, images[0]
+    k = get_backend(backend, None)  # that of `equations`
+    empty = type(k).empty
+
+    def poisoned(self, *shape, dtype=np.float32):
+        array = empty(self, *shape, dtype=dtype)
+        most = np.nan if np.dtype(dtype) == np.float32 else 2**31 - 1
+        if hasattr(array, "fill_"):
+            array.fill_(most)
+        elif array.size:
+            value = np.full(1, most, dtype)
+            cl.enqueue_fill_buffer(self.queue, array.data, value, 0, array.size * value.itemsize)
+        return array
+
+    monkeypatch.setattr(type(k), "empty", poisoned)
+    k.scratch.give_up()
+    desired = equations("numpy", *given)
     assert_allclose(equations(backend, *given), desired, rtol=0, atol=1e-5 * desired.max())
 
 
