@@ -268,6 +268,28 @@ def test_equations_read_nothing_that_is_not_written_before(backend, monkeypatch)
     assert_allclose(equations(backend, *given), desired, rtol=0, atol=1e-5 * desired.max())
 
 
+def test_equations_write_to_nothing_that_comes_from_the_host(backend, monkeypatch):
+    """Drivers may trust that it is only read, and keep a copy of it."""
+    images, flows = prototypes("random", (BAND, 40))
+    k, scale = get_backend(backend, None), np.ones((BAND, 40), np.float32)
+    to_device, launch_all, brought, written = type(k).to_device, type(k).launch_all, [], []
+
+    def bringing(self, array):
+        brought.append(to_device(self, array))
+        return brought[-1]
+
+    def launching(self, kernel, count, inputs, outputs):
+        written.extend(outputs)
+        launch_all(self, kernel, count, inputs, outputs)
+
+    monkeypatch.setattr(type(k), "to_device", bringing)
+    monkeypatch.setattr(type(k), "launch_all", launching)
+    equations(backend, images, flows, flows[1], range(NUMBER), scale, images[0])
+    assert brought
+    assert written
+    assert not {id(a) for a in brought} & {id(a) for a in written}
+
+
 def test_equations_keep_no_picture(backend, monkeypatch):
     """No array has room for the prototypes in all of their rows."""
     k, size = replace(get_backend(backend)), (5 * BAND, 20)

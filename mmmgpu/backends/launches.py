@@ -64,6 +64,10 @@ class Launches(ABC):
         """An uninitialised device array."""
 
     @abstractmethod
+    def zeros(self, *shape: int, dtype: Any = np.float32) -> Any:
+        """A device array to add to. What `to_device` gives is for reading: it may be the host's."""
+
+    @abstractmethod
     def reshaped(self, array: Any, *shape: int) -> Any:
         """The same device array with other axes."""
 

@@ -49,8 +49,8 @@ def _products(
     sizes = [COLOURS * (bottom - top) * pitch for top, bottom in bands]  # values of an image
     most = sum(math.ceil(n / PIECE) for n in (*sizes, COLOURS * room))
     parts, pieces = k.empty(most, number + 1, number), 0
-    flags = k.to_device(np.zeros((height, pitch), np.float32))
-    ends = k.to_device(np.zeros(height + 1, np.int32))
+    flags = k.zeros(height, pitch)
+    ends = k.zeros(height + 1, dtype=np.int32)
     for (top, bottom), size in zip(bands, sizes, strict=True):
         inputs = [flow, *held.arrays, used, scale, height, width, held.pyramid, ring, held.nodes]
         inputs += [held.hole, depth, top, bottom]

@@ -144,6 +144,12 @@ class Warp(PrototypeLaunches):
             use_huge_pages(made.ptr, made.capacity)
         return made
 
+    def zeros(self, *shape: int, dtype: Any = np.float32) -> Any:
+        made = self.empty(*shape, dtype=dtype)
+        with _faults_of(self.device):
+            made.zero_()
+        return made
+
     def reshaped(self, array: Any, *shape: int) -> Any:
         return array.reshape(shape)
 

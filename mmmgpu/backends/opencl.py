@@ -186,6 +186,12 @@ class OpenCL(PrototypeLaunches):
         data = self._allocated(self.memory.allocate, size) if size else None
         return Array(data, shape, kind)
 
+    def zeros(self, *shape: int, dtype: Any = np.float32) -> Any:
+        made, zero = self.empty(*shape, dtype=dtype), np.zeros(1, dtype)
+        with _faults_of(self.name):
+            cl.enqueue_fill_buffer(self.queue, made.data, zero, 0, made.size * zero.itemsize)
+        return made
+
     def reshaped(self, array: Any, *shape: int) -> Any:
         return replace(array, shape=shape)
 
