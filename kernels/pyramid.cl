@@ -39,8 +39,9 @@ float pull(__global const float *fine, const int step, const int h, const int w,
 float4 mean(__global const float *cells, const int i, const int step)
 {
     const float n = cells[i + 3 * step];
-    const float share = n > 0.0f ? 1.0f / n : 0.0f;
-    return share * (float4)(cells[i], cells[i + step], cells[i + 2 * step], n);
+    const float known = n > 0.0f ? 1.0f : 0.0f;
+    const float share = n > 0.0f ? 1.0f / n : 0.0f; /* n times it may be less than 1 on a GPU */
+    return (float4)(share * cells[i], share * cells[i + step], share * cells[i + 2 * step], known);
 }
 
 /* The pixel (x, y) of a level of h x w, interpolated from four cells of the next one.

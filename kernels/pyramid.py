@@ -45,8 +45,9 @@ def pull(
 def mean(cells: wp.array[float], i: int, step: int):
     """Of a cell; the fourth is 1, or 0 where it is empty."""
     n = cells[i + 3 * step]
-    share = wp.where(n > 0.0, 1.0 / n, 0.0)
-    return share * wp.vec4(cells[i], cells[i + step], cells[i + 2 * step], n)
+    known = wp.where(n > 0.0, 1.0, 0.0)
+    share = wp.where(n > 0.0, 1.0 / n, 0.0)  # n times it may be less than 1 on a GPU
+    return wp.vec4(share * cells[i], share * cells[i + step], share * cells[i + 2 * step], known)
 
 
 @wp.func

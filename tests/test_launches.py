@@ -1,5 +1,6 @@
 """What every runtime makes of moved and mixed prototypes, against the reference."""
 
+import functools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -10,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_operations_equivalence import FLOWS, SIZES
 
-from mmmgpu.backends import get_backend
+from mmmgpu.backends import get_backend, opencl
 from mmmgpu.backends.launches import GPU_WORKERS
 from mmmgpu.backends.moved_equations import BAND
 from mmmgpu.backends.planes import planes
@@ -288,6 +289,21 @@ def test_equations_write_to_nothing_that_comes_from_the_host(backend, monkeypatc
     assert brought
     assert written
     assert not {id(a) for a in brought} & {id(a) for a in written}
+
+
+def test_divisions_may_be_as_coarse_as_opencl_allows(monkeypatch):
+    """By 2.5 units in the last place, as on GPUs: that a cell is known must not depend on it."""
+    images, flows = prototypes("random", (33, 40))
+    given = images, flows, flows[1], range(NUMBER), np.ones((33, 40), np.float32)
+    desired, included = moved("opencl", *given), opencl._included
+    monkeypatch.setattr(
+        opencl, "_included", lambda line: included(line).replace("1.0f / n", "0.9999998f / n")
+    )
+    for cached in (opencl._kernel, opencl._program):
+        monkeypatch.setattr(opencl, cached.__name__, functools.cache(cached.__wrapped__))
+    actual = moved("opencl", *given)
+    assert_allclose(actual, desired, rtol=0, atol=1e-5)
+    assert not np.array_equal(actual, desired)
 
 
 def test_equations_keep_no_picture(backend, monkeypatch):
