@@ -66,6 +66,7 @@ def test_nothing_is_allocated_for_further_frames(monkeypatch, own, basis):
             analyze(analyzer, image)
         return own.memory.allocated
 
+    frames()  # scratch that is kept from here on may be what synthesis gave back
     first = frames()
     assert [frames() for _ in range(3)] == 3 * [first]
 
