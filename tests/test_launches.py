@@ -291,6 +291,26 @@ def test_equations_write_to_nothing_that_comes_from_the_host(backend, monkeypatc
     assert not {id(a) for a in brought} & {id(a) for a in written}
 
 
+def test_equations_seldom_begin_again_where_ever_more_pixels_are_set_aside(backend, monkeypatch):
+    k, size = replace(get_backend(backend)), (BAND, 96)
+    x = np.arange(96) + np.zeros(size)
+    images, flows = prototypes("zero", size)
+    held, scale = k.hold_prototypes(images, flows, HOLE), k.to_device(np.ones(size, np.float32))
+    image, launch_all, begun = k.to_device(planes(images[0])), type(k).launch_all, []
+
+    def counted(self, kernel, count, inputs, outputs):
+        begun.append(kernel == "prototype_equations.advance")
+        launch_all(self, kernel, count, inputs, outputs)
+
+    monkeypatch.setattr(type(k), "launch_all", counted)
+    frames = range(14, 40)
+    for gap in frames:
+        right = np.where(x < 48, -gap, gap)
+        flow = np.stack([right, 0 * right], -1).astype(np.float32)
+        k.prototype_equations(held, planes(flow), np.arange(NUMBER), image, scale)
+    assert len(frames) < sum(begun) < len(frames) + 8
+
+
 def test_divisions_may_be_as_coarse_as_opencl_allows(monkeypatch):
     """By 2.5 units in the last place, as on GPUs: that a cell is known must not depend on it."""
     images, flows = prototypes("random", (33, 40))

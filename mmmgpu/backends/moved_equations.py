@@ -39,7 +39,7 @@ def _products(
 ) -> tuple[Any, int, int]:
     """Run kernels/prototype_equations with so many rows of sums, and so many pixels set aside.
 
-    Returns: The products, or None where there is too little room; and how much is needed of both.
+    Returns: The products, or None where there is too little room; and how much to begin with then.
     """
     flow, used, wanted, scale = given
     number, height, width, pitch = used.shape[0], held.height, held.width, held.pitch
@@ -63,7 +63,7 @@ def _products(
         pieces = k.multiply(s.band, s.band_wanted, stride, size, pieces, parts)
     needed, found = int(k.to_host(s.states)[:number, 0].max()), int(k.to_host(ends)[height])
     if needed > ring or found > room:
-        return None, max(needed, ring), max(found, room)
+        return None, max(needed, ring), max(found + found // ASIDE, room)  # for next frames too
     arrived = k.empty(number, dtype=np.int32)
     inputs = [s.holes, s.slots, scale, s.states, height, width, held.pyramid, room]
     k.launch_all("prototype_equations.finish", number, inputs, [s.cells, s.aside, arrived])
