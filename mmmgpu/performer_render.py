@@ -35,13 +35,16 @@ _REST_FOLD = 0.40
 class Portrait:
     """The neutral head in layers, and the parts of the picture that move.
 
-    `face` is the moving layer, `behind` and `front` lie below and above it; `shadow` is what the
-    chin takes from `behind`; `still` is the finished neutral picture (uint8); `mouth` and `eyes`
-    are the windows of it that every frame paints again.
+    `colour` (albedo and alpha), `relief` (height, fold, lit and gloss) and `lip` are the moving
+    layer, the face; `behind` and `front` lie below and above it; `shadow` is what the chin takes
+    from `behind`; `still` is the finished neutral picture (uint8); `mouth` and `eyes` are the
+    windows of it that every frame paints again.
     """
 
     grid: Grid
-    face: Surface
+    colour: Image
+    relief: Image
+    lip: Image
     behind: Image
     front: Image
     front_alpha: Image
@@ -76,9 +79,10 @@ def portrait(performer: Performer) -> Portrait:
     still = to_bytes(over(picture, front, front_alpha))
     weight = np.float32(1) * pose_weight(grid.x, grid.y)
     fibres = np.random.default_rng((performer.seed, 8)).normal(size=(8, 120)).astype(np.float32)
-    return Portrait(
-        grid, face, behind, front, front_alpha, shadow, weight, fibres, still, mouth, eyes
-    )
+    colour = np.dstack([face.albedo, face.alpha])
+    relief = np.dstack([face.height, face.fold, face.lit, face.gloss])
+    layers = colour, relief, face.lip, behind, front, front_alpha, shadow
+    return Portrait(grid, *layers, weight, fibres, still, mouth, eyes)
 
 
 def _with_brows(performer: Performer, face: Surface, cover: Image) -> Surface:
@@ -134,7 +138,10 @@ def paint_frame(performer: Performer, articulation: Articulation, t: int) -> NDA
     art = portrait(performer)
     canvas = art.still.copy()
     repaint(performer, art, canvas, articulation, t)
-    return _posed(performer, art, canvas, articulation.pose[t])
+    pose = articulation.pose[t]
+    moved = _posed(art, canvas, pose) if pose.any() else canvas
+    height, width = performer.size
+    return np.asarray(cv2.resize(moved, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def repaint(
@@ -151,9 +158,9 @@ def repaint(
 
 
 def _posed(
-    performer: Performer, art: Portrait, canvas: NDArray[np.uint8], pose: NDArray[np.float64]
+    art: Portrait, canvas: NDArray[np.uint8], pose: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Move the head (the map of `undo_pose`) and reduce to the output's size."""
+    """Move the head (the map of `undo_pose`)."""
     g, (dx, dy, roll, log_scale) = art.grid, np.asarray(pose, np.float32)
     c, s = np.cos(-roll) * np.exp(-log_scale), np.sin(-roll) * np.exp(-log_scale)
     px, py = g.x - dx, g.y - dy - np.float32(0.7)
@@ -161,8 +168,7 @@ def _posed(
     hy = g.y + art.weight * (s * px + c * py + np.float32(0.7) - g.y)
     cols, rows = _pixels(g, hx, hy)
     moved = cv2.remap(canvas, cols, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    height, width = performer.size
-    return np.asarray(cv2.resize(moved, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(moved, np.uint8)
 
 
 def _pixels(grid: Grid, x: Image, y: Image) -> tuple[Image, Image]:
@@ -176,11 +182,9 @@ def _carry(layer: Image, cols: Image, rows: Image) -> Image:
     )
 
 
-def _carry_surface(face: Surface, cols: Image, rows: Image) -> Surface:
-    """The surface as seen through a map of pixels."""
-    colour = _carry(np.dstack([face.albedo, face.alpha]), cols, rows)
-    relief = _carry(np.dstack([face.height, face.fold, face.lit, face.gloss]), cols, rows)
-    lip = _carry(face.lip, cols, rows)
+def _carry_surface(art: Portrait, cols: Image, rows: Image) -> Surface:
+    """The face as seen through a map of pixels."""
+    colour, relief, lip = (_carry(layer, cols, rows) for layer in (art.colour, art.relief, art.lip))
     return Surface(
         np.ascontiguousarray(colour[..., :3]),
         colour[..., 3],
@@ -204,13 +208,15 @@ def _paint_lower_face(performer: Performer, art: Portrait, a: dict[str, float]) 
     u = squeeze(shape, p, grid.x, v)
     cols, rows = _pixels(art.grid, np.float32(1) * u, np.float32(1) * v)
     cols, rows = cols.astype(np.float32), rows.astype(np.float32)
-    face = _carry_surface(art.face, cols, rows)
+    face = _carry_surface(art, cols, rows)
     skin = _shade_face(performer, grid, _swell(performer, grid, face, p, a, top, bottom), _fold(a))
-    gap = Opening(top, bottom)
-    aperture = _aperture(grid, gap)
+    aperture = _aperture(grid, Opening(top, bottom))
     if aperture.any():
-        inside = paint_inside(performer, grid, p, gap, (a["tongue_height"], a["tongue_advance"]))
-        skin = over(skin, inside, aperture)
+        seen = _around(aperture)
+        part, between = grid.window(*seen), Opening(top[seen[1]], bottom[seen[1]])
+        tongue = a["tongue_height"], a["tongue_advance"]
+        inside = paint_inside(performer, part, p, between, tongue)
+        skin[seen] = over(skin[seen], inside, aperture[seen])
     shadow = _carry(art.shadow, cols, rows)
     picture = over(art.behind[art.mouth] * (1 - shadow)[..., None], skin, face.alpha)
     return over(picture, art.front[art.mouth], art.front_alpha[art.mouth])
@@ -227,6 +233,12 @@ def _aperture(grid: Grid, gap: Opening) -> Image:
     above = np.clip((grid.y - gap.upper) * grid.px + 0.5, 0, 1)
     below = np.clip((gap.lower - grid.y) * grid.px + 0.5, 0, 1)
     return np.asarray(above * below * np.clip(span, 0, 1), np.float32)
+
+
+def _around(cover: Image) -> tuple[slice, slice]:
+    """The window of all that `cover` covers, which is something."""
+    rows, cols = (np.flatnonzero(cover.any(axis=axis)) for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
 
 
 def _swell(
@@ -262,7 +274,7 @@ def _paint_eyes(
     edge = lids(shape, grid.x, float(blink))
     v = lid_map(edge, grid.y)
     cols, rows = _pixels(art.grid, grid.x, v)
-    face = _carry_surface(art.face, cols, rows)
+    face = _carry_surface(art, cols, rows)
     skin = _shade_face(performer, grid, face, _REST_FOLD)
     skin = skin * lash_shadow(shape, edge, grid.y, float(blink))[..., None]
     balls = paint_eyeballs(performer, grid, edge, (float(gaze[0]), float(gaze[1])), art.fibres)

@@ -72,7 +72,7 @@ def _look(performer: Performer, p: Pucker, x: Array, y: Array) -> _View:
     v = to_neutral(c, edge, upper)
     u = squeeze(shape, p, x, v)
     inside = (y > top) & (y < bottom)
-    face = _sample(performer, portrait(performer).face.alpha, u, v) > 0.5
+    face = _sample(performer, portrait(performer).colour[..., 3], u, v) > 0.5
     front = _sample(performer, portrait(performer).front_alpha, x, y) > 0.5
     return _View(x, y, u, v, upper, inside, face & ~front)
 

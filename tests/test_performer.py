@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mmmgpu import performer_render
 from mmmgpu.errors import InputError
 from mmmgpu.performer import (
     ARTICULATORS,
@@ -55,6 +56,18 @@ def test_pictures_have_the_promised_shape(face):
     frames = list(render(face, posed(CLOSED, OPEN)))
     assert len(frames) == 2
     assert all(f.shape == (*SIZE, 3) and f.dtype == np.uint8 for f in frames)
+
+
+def test_a_head_at_rest_is_painted_as_one_that_moves(face):
+    still, moved = (posed(OPEN, pose=[[pose] * 4]) for pose in (0, 1e-9))
+    np.testing.assert_array_equal(next(render(face, still)), next(render(face, moved)))
+
+
+@pytest.mark.parametrize("part", [OPEN, SPREAD, ROUND])
+def test_the_mouth_is_painted_inside_as_if_it_were_wide_open(face, monkeypatch, part):
+    quick = next(render(face, posed(part)))
+    monkeypatch.setattr(performer_render, "_around", lambda cover: np.s_[:, :])
+    np.testing.assert_array_equal(quick, next(render(face, posed(part))))
 
 
 def test_rendering_is_lazy(face):
