@@ -268,6 +268,13 @@ def test_a_library_that_is_missing_is_named(monkeypatch):
 
 
 @pytest.fixture
+def small_machine(monkeypatch):
+    """Its bandwidth and peaks are those of little data: what they are is not the question."""
+    monkeypatch.setattr(machine, "COPIED", 1 << 20)
+    monkeypatch.setattr(machine, "SIDE", 64)
+
+
+@pytest.fixture
 def one_thread(monkeypatch):
     monkeypatch.setenv("MMMGPU_THREADS", "1")
     yield
@@ -275,7 +282,7 @@ def one_thread(monkeypatch):
     peers.use_threads(default_threads(), PEERS)
 
 
-@pytest.mark.usefixtures("one_thread")
+@pytest.mark.usefixtures("one_thread", "small_machine")
 def test_libraries_use_the_threads_that_ours_do(monkeypatch):
     used = {}
 
@@ -287,7 +294,6 @@ def test_libraries_use_the_threads_that_ours_do(monkeypatch):
         return {}
 
     monkeypatch.setattr(runs, "measure_startup", ask)
-    monkeypatch.setattr(machine, "COPIED", 1 << 20)
     runs.run_benchmarks(runs.Plan(parts=["startup"], peers=True))
     assert {*used.values()} == {1}
 
@@ -471,6 +477,7 @@ def test_frames_that_grow_are_frames_that_are_made(axis):
     assert [LENGTHS[axis](make("opencl", n)()) for n in (25, 50)] == [25, 50]
 
 
+@pytest.mark.usefixtures("small_machine")
 @pytest.mark.parametrize(("quick", "turns"), [(True, 3), (False, 11)])
 def test_growth_takes_as_many_turns_as_single_works(monkeypatch, quick, turns):
     taken = []
@@ -597,8 +604,8 @@ def test_a_thread_that_waits_is_not_in_the_profile():
     thread.join()
 
 
-def test_the_command_writes_a_record_and_compares_it(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(machine, "COPIED", 1 << 20)
+@pytest.mark.usefixtures("small_machine")
+def test_the_command_writes_a_record_and_compares_it(tmp_path, capfd):
     mmmgpu, out = partial(run_command, capfd), tmp_path / "one.json"
     ended = mmmgpu("bench", "--quick", "--part", "kernels", "--only", "blend", "--json", out)
     assert ended.status == 0
@@ -615,9 +622,9 @@ def test_the_command_writes_a_record_and_compares_it(tmp_path, capfd, monkeypatc
     assert "pipeline [s]" in ended.out
 
 
+@pytest.mark.usefixtures("small_machine")
 def test_a_pipeline_without_a_voice_is_said_and_left_out(monkeypatch):
     monkeypatch.setattr(runs, "is_installed", lambda: False)
-    monkeypatch.setattr(machine, "COPIED", 1 << 20)
     found = runs.run_benchmarks(runs.Plan(parts=["pipeline"]))
     assert "pipeline" not in found
     assert found["absent"] == ["a voice for the pipeline (mmmgpu[tts])"]
