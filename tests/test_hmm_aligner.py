@@ -113,7 +113,7 @@ def test_a_misfit_is_how_much_better_other_phones_explain_the_frames(lexicon, tr
             label: max(
                 np.logaddexp.reduce(
                     [
-                        np.log(w) + norm(m, np.sqrt(v)).logpdf(x).sum()
+                        np.log(w) + norm.logpdf(x, m, np.sqrt(v)).sum()
                         for w, m, v in zip(
                             hmms.weights[q], hmms.means[q], hmms.variances[q], strict=True
                         )
