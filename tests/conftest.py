@@ -11,8 +11,11 @@ from postgres import find_programs, running
 from studied import write_clips
 from worlds import make_postures, make_world
 
+from mmmgpu.adaptation import adapt
 from mmmgpu.backends import BACKENDS, get_backend
+from mmmgpu.model_files import load
 from mmmgpu.study_creation import StudyOptions, create_study
+from mmmgpu.transferring import transfer
 
 hypothesis.settings.register_profile("busy", deadline=None)  # timing is not what is tested
 hypothesis.settings.load_profile("busy")
@@ -59,6 +62,22 @@ def world(tmp_path_factory):
 def two_persons(world, tmp_path_factory):
     """The person of `world` with a model, and another one with two clips; see `pairs`."""
     return make_two_persons(world, tmp_path_factory.mktemp("second"))
+
+
+@pytest.fixture(scope="session")
+def transferred(two_persons, tmp_path_factory):
+    """The first one's model with the face of the second: its path, and the model."""
+    out = tmp_path_factory.mktemp("transferred") / "second ü.mmm"
+    given = two_persons.second.clips, two_persons.second.alignments, two_persons.points
+    return out, transfer(load(two_persons.source), *given, out)
+
+
+@pytest.fixture(scope="session")
+def adapted(two_persons, transferred, tmp_path_factory):
+    """That model in the style of the second: its path, and the model."""
+    out = tmp_path_factory.mktemp("adapted") / "a.mmm"
+    given = two_persons.second.clips, two_persons.second.alignments
+    return out, adapt(transferred[1], *given, out)
 
 
 @pytest.fixture(scope="session")

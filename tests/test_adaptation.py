@@ -15,24 +15,14 @@ from mmmgpu.evaluation import evaluate
 from mmmgpu.model_files import load
 from mmmgpu.models import phonemes_of, trajectories
 from mmmgpu.reconstruction import analyse_clip
-from mmmgpu.transferring import transfer
 from mmmgpu.video_writing import write_video
 from mmmgpu.videos import read_frames
 
 
 @pytest.fixture(scope="module")
-def before(two_persons, tmp_path_factory):
+def before(transferred):
     """The transferred model."""
-    out = tmp_path_factory.mktemp("before") / "b.mmm"
-    clips, folder = two_persons.second.clips, two_persons.second.alignments
-    return transfer(load(two_persons.source), clips, folder, two_persons.points, out)
-
-
-@pytest.fixture(scope="module")
-def adapted(two_persons, before, tmp_path_factory):
-    """The path of the adapted model, and the model."""
-    out = tmp_path_factory.mktemp("adapted") / "a.mmm"
-    return out, take_style(two_persons, before, out)
+    return transferred[1]
 
 
 def take_style(two_persons, before, out, *, clips=None, folder=None, **options):

@@ -3,23 +3,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mmmgpu.adaptation import adapt
 from mmmgpu.corpora import open_corpus
 from mmmgpu.model_files import load
 from mmmgpu.reconstruction import analyse_clip
 from mmmgpu.trajectory_files import Trajectory
 from mmmgpu.transfer_reports import points_in_clips, write_transfer_report
-from mmmgpu.transferring import transfer
 
 
 @pytest.fixture(scope="module")
-def stages(two_persons, tmp_path_factory):
+def stages(two_persons, transferred, adapted):
     """The first person's model, the transferred one, and the adapted one."""
-    folder = tmp_path_factory.mktemp("stages")
-    second, source = two_persons.second, load(two_persons.source)
-    given = second.clips, second.alignments
-    before = transfer(source, *given, two_persons.points, folder / "b.mmm")
-    return source, before, adapt(before, *given, folder / "a.mmm")
+    return load(two_persons.source), transferred[1], adapted[1]
 
 
 def test_all_figures_are_there(two_persons, stages, tmp_path):

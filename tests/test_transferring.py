@@ -31,20 +31,13 @@ def move(two_persons, out, *, points=None, clips=None, **options):
     return transfer(source, clips, folder, points or two_persons.points, out, options=given)
 
 
-@pytest.fixture(scope="module")
-def moved(two_persons, tmp_path_factory):
-    """The path of a transferred model, and the model."""
-    out = tmp_path_factory.mktemp("moved") / "second ü.mmm"
-    return out, move(two_persons, out)
-
-
 def frame_of(world, name, t):
     clip = next(c for c in world.clips if c.name == name)
     return next(read_frames(clip, start=t, stop=t + 1))
 
 
-def test_the_face_is_the_second_the_style_the_first(two_persons, moved):
-    out, model = moved
+def test_the_face_is_the_second_the_style_the_first(two_persons, transferred):
+    out, model = transferred
     source = load(two_persons.source)
     assert [path.name for path in out.parent.iterdir()] == [out.name]
     assert len(model.sources) == len(source.sources)
@@ -61,8 +54,8 @@ def test_the_face_is_the_second_the_style_the_first(two_persons, moved):
     assert load(out).notes == model.notes
 
 
-def test_the_reference_is_the_marked_frame_seen_as_it_is(two_persons, moved):
-    model = moved[1]
+def test_the_reference_is_the_marked_frame_seen_as_it_is(two_persons, transferred):
+    model = transferred[1]
     (closed,) = [p for p in read_points(two_persons.points) if p.kind == CLOSED]
     i = model.basis.reference
     assert model.sources[i] == (closed.b.clip, closed.b.frame)
@@ -72,8 +65,8 @@ def test_the_reference_is_the_marked_frame_seen_as_it_is(two_persons, moved):
     np.testing.assert_allclose(model.basis.images[i], frame / 255, atol=1e-3)
 
 
-def test_the_region_lies_on_the_second_mouth(world, two_persons, moved):
-    model, second = moved[1], two_persons.second
+def test_the_region_lies_on_the_second_mouth(world, two_persons, transferred):
+    model, second = transferred[1], two_persons.second
     name, t = model.sources[model.basis.reference]
     motion = second.motions[[c.name for c in second.clips].index(name)]
     lips = landmarks(second.face, motion, t)[:20]
@@ -94,8 +87,8 @@ def test_the_region_lies_on_the_second_mouth(world, two_persons, moved):
     assert model.basis.w_f[0].max() < 0.05
 
 
-def test_the_masks_are_carried_with_the_points(two_persons, moved):
-    source, model = load(two_persons.source), moved[1]
+def test_the_masks_are_carried_with_the_points(two_persons, transferred):
+    source, model = load(two_persons.source), transferred[1]
     (closed,) = [p for p in read_points(two_persons.points) if p.kind == CLOSED]
     boxes = [np.array(m.basis.region.box[:2]) for m in (source, model)]
     s = rbf_correspondence(closed.points_a - boxes[0], closed.points_b - boxes[1])
@@ -118,17 +111,17 @@ def true_openings(persons, sources):
     return found
 
 
-def test_open_mouths_are_matched_with_open_mouths(world, two_persons, moved):
+def test_open_mouths_are_matched_with_open_mouths(world, two_persons, transferred):
     first = np.array(true_openings(world, load(two_persons.source).sources))
-    second = np.array(true_openings(two_persons.second, moved[1].sources))
+    second = np.array(true_openings(two_persons.second, transferred[1].sources))
     assert {True, False} == set(first > 0.33)
     np.testing.assert_array_equal(first > 0.33, second > 0.33)
 
 
-def test_the_history_is_kept(two_persons, moved):
-    found = moved[1].notes["matching"]
+def test_the_history_is_kept(two_persons, transferred):
+    found = transferred[1].notes["matching"]
     history = np.array(found["history"])
-    assert history.shape[1] == len(moved[1].sources)
+    assert history.shape[1] == len(transferred[1].sources)
     assert np.array(found["flow_distance"]).shape == history.shape
     assert np.array(found["texture_distance"]).shape == history.shape
     assert found["iterations"] == len(history) - 1
@@ -136,18 +129,18 @@ def test_the_history_is_kept(two_persons, moved):
     assert found["folded_share"][CLOSED] < 0.02
     frames = [clip.name for clip in two_persons.second.clips for _ in range(probe(clip).frames)]
     if found["outcome"] == "fixed point":
-        assert [frames[i] for i in history[-1]] == [name for name, _ in moved[1].sources]
+        assert [frames[i] for i in history[-1]] == [name for name, _ in transferred[1].sources]
 
 
-def test_the_second_person_speaks(two_persons, moved, tmp_path):
+def test_the_second_person_speaks(two_persons, transferred, tmp_path):
     clip = two_persons.second.clips[0]
     alignment = read_alignment(clip.with_suffix(".TextGrid"))
-    speak(moved[1], Speech(*read_sound(clip), alignment), tmp_path / "s.mkv", lossless=True)
+    speak(transferred[1], Speech(*read_sound(clip), alignment), tmp_path / "s.mkv", lossless=True)
     assert probe(tmp_path / "s.mkv").frames == probe(clip).frames
 
 
 def test_an_interrupted_transfer_continues_to_the_same_bytes(
-    two_persons, moved, tmp_path, monkeypatch
+    two_persons, transferred, tmp_path, monkeypatch
 ):
     out = tmp_path / "again.mmm"
     calls = interrupt_second_step(monkeypatch)
@@ -156,7 +149,7 @@ def test_an_interrupted_transfer_continues_to_the_same_bytes(
     assert not out.exists()
     move(two_persons, out)
     assert calls[2] == []  # nothing is tracked again
-    assert out.read_bytes() == moved[0].read_bytes()
+    assert out.read_bytes() == transferred[0].read_bytes()
     assert [p.name for p in tmp_path.iterdir()] == [out.name]
 
 
