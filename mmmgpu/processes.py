@@ -40,8 +40,11 @@ _IDLE: ContextVar[list[Child] | None] = ContextVar("idle", default=None)
 def kept_processes() -> Iterator[None]:
     """Inside, children that have done their work are given more; they keep what memory they have.
 
-    Others are started only where these are too few.
+    Others are started only where these are too few. Inside another one, its children are kept on.
     """
+    if _IDLE.get() is not None:
+        yield
+        return
     idle: list[Child] = []
     token = _IDLE.set(idle)
     try:

@@ -14,6 +14,7 @@ from worlds import make_postures, make_world
 from mmmgpu.adaptation import adapt
 from mmmgpu.backends import BACKENDS, get_backend
 from mmmgpu.model_files import load
+from mmmgpu.processes import kept_processes
 from mmmgpu.study_creation import StudyOptions, create_study
 from mmmgpu.transferring import transfer
 
@@ -50,6 +51,13 @@ def backend(request):
 def family(backend):
     """The name of that backend without its device: a key of `BACKENDS`."""
     return backend.partition(":")[0]
+
+
+@pytest.fixture(scope="module")
+def kept():
+    """The processes of one job do those that follow in the module, which start sooner."""
+    with kept_processes():
+        yield
 
 
 @pytest.fixture(scope="session")

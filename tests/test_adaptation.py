@@ -18,6 +18,8 @@ from mmmgpu.reconstruction import analyse_clip
 from mmmgpu.video_writing import write_video
 from mmmgpu.videos import read_frames
 
+pytestmark = pytest.mark.usefixtures("kept")
+
 
 @pytest.fixture(scope="module")
 def before(transferred):

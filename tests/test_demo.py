@@ -16,6 +16,8 @@ from mmmgpu.video_writing import write_video
 from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import say
 
+pytestmark = pytest.mark.usefixtures("kept")
+
 SHORT = {
     "seed": 5,
     "script": Script(("Papa bought a boat.", "We saw five fish."), ("My map.", "Oh boy."), "Bye."),

@@ -159,6 +159,17 @@ def test_kept_processes_do_one_job_after_another():
     assert len(set(pids(1) + pids(1))) == 2
 
 
+def test_processes_are_kept_until_the_outermost_ends():
+    with kept_processes():
+        found = []
+        for _ in range(2):
+            with kept_processes():
+                found += map_out(tell, [1, 2], processes=2, advance=lambda n: None)
+        assert len(set(found)) == 2
+        assert not any(map(gone, found))
+    assert all(map(gone, found))
+
+
 def test_a_kept_process_that_has_died_is_replaced():
     with kept_processes():
         first = map_out(tell, [1, 2], processes=2, advance=lambda n: None)

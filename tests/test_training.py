@@ -23,6 +23,8 @@ from mmmgpu.training import Options, train
 from mmmgpu.video_writing import write_video
 from mmmgpu.videos import read_frames
 
+pytestmark = pytest.mark.usefixtures("kept")
+
 OPTIONS = Options(prototypes=6, seed=2)
 CHILD = """
 import sys

@@ -10,6 +10,8 @@ from mmmgpu.points import read_points
 from mmmgpu.reference_pairs import source_references
 from mmmgpu.videos import probe
 
+pytestmark = pytest.mark.usefixtures("kept")
+
 
 @pytest.fixture
 def mmmgpu(capfd):

@@ -22,6 +22,8 @@ from mmmgpu.transferring import TransferOptions, transfer
 from mmmgpu.videos import probe, read_frames
 from mmmgpu.voices import Speech
 
+pytestmark = pytest.mark.usefixtures("kept")
+
 
 def move(two_persons, out, *, points=None, clips=None, **options):
     clips = clips or two_persons.second.clips
