@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from mmmgpu.alignments import Alignment
 from mmmgpu.analysis import byte_thumbnail
+from mmmgpu.backends import default_threads
 from mmmgpu.basis import Basis
 from mmmgpu.corpora import Clip
 from mmmgpu.errors import InputError
 from mmmgpu.flows import matcher
 from mmmgpu.frames import Frames
 from mmmgpu.models import Model
-from mmmgpu.parallel import one_thread_each
+from mmmgpu.parallel import Cancelled, map_ordered, one_thread_each
 from mmmgpu.points import CLOSED, OPEN
 from mmmgpu.progress import progress_bar
 from mmmgpu.prototypes import most_neutral, principal_coordinates
@@ -188,12 +189,16 @@ def _most_usual(frames: Frames, region: Region, sync: float) -> int:
 def _most_open_frame(frames: Frames, region: Region, closed: int) -> int:
     match, weight = matcher(), lip_mask(region)
     origin = frames.crops([closed], region)[closed]
-    scores = []
+
+    def score(seen: tuple[F32, bool], _: Cancelled) -> float:
+        image, usable = seen
+        return openness(match(origin, image), region, weight) if usable else -np.inf
+
+    scores: list[float] = []
     for clip in frames.clips:
         track = frames.tracks[clip.name]
-        for image, usable in zip(crops(clip.path, track, region), track.registered, strict=True):
-            flow = match(origin, image)
-            scores.append(openness(flow, region, weight) if usable else -np.inf)
+        seen = zip(crops(clip.path, track, region), track.registered, strict=True)
+        scores += map_ordered(score, seen, threads=default_threads())
     return int(np.argmax(scores))
 
 
