@@ -62,9 +62,10 @@ int show(__global float *total, const int y, const int h, const int w, const int
     return found;
 }
 
-/* Add to holes what is interpolated for them, where the cells of the rows that are shown tell it.
+/* Add to holes what is interpolated for them, where no cell is empty that it is made of, and all are
+ * final: those of two rows below are shown, or all are.
  *
- * Returns how many are left; they are the first of the list then.
+ * Returns how many holes are left; they are the first of the list then.
  */
 int mend(__global int *holes, const int found, const int h, const int w, const int pitch,
          const int shown, const float weight, __global const float *scale,

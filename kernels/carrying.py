@@ -1,6 +1,7 @@
 """Prototypes carried along a flow: splatted (rings), shown row by row, holes filled (pyramid).
 
-Pixels that received too little are listed when their row is shown, and filled later.
+Pixels that received too little are listed when their row is shown, and filled later. Each array
+comes with the index where what belongs to a prototype begins; OpenCL has pointers there.
 """
 
 import warp as wp
@@ -164,9 +165,10 @@ def mend(
     out: wp.array[float],
     start: int,
 ):
-    """Add to holes what is interpolated for them, where the cells of the rows `shown` tell it.
+    """Add to holes what is interpolated for them, where no cell is empty that it is made of.
 
-    Returns how many are left; they are the first of the list then.
+    Cells must be final: those of two rows below are `shown`, or all are. Returns how many holes are
+    left; they are the first of the list then.
     """
     left = int(0)
     for k in range(found):

@@ -14,7 +14,10 @@
 
 #define WHITE 65535.0f /* the brightest value of a texture */
 
-/* Each prototype, until the rows before `bottom` are shown; before the first band, its residual flow. */
+/* Each prototype, until the rows before `bottom` are shown; before the first band, its residual flow.
+ *
+ * One that needs more rows of sums than there is room for only says so in its state.
+ */
 __kernel void advance(
     __global const float *flow,        /* (2, H, pitch) [px] between 16 numbers */
     __global const ushort16 *textures, /* from here to row_shares as in prototypes.cl */
@@ -43,7 +46,7 @@ __kernel void advance(
     /* outputs */
     __global float *residual,          /* (N, 2, nodes) [px] */
     __global int *opens,               /* (N, H + 1) see reach */
-    __global int4 *states,             /* (N) see carry_on */
+    __global int4 *states,             /* (N) see carry_on; of holes those that are left */
     __global float *total,             /* (N, ring, pitch + 40, 4) scratch: sums */
     __global float *cells,             /* (N, 4 size) the pyramids */
     __global int *places,              /* (N, 2, pitch) scratch */
@@ -104,7 +107,7 @@ void take(__global float *from, const int apart, const int *lanes, const int num
 
 /* A row of what is wanted; and of all pictures, the pixels of a row that are a hole in one of them.
  *
- * Those that there is no room for are counted.
+ * Those that there is no room for are only counted, and stay in the band.
  */
 __kernel void set_aside(
     __global const float *flags,

@@ -48,7 +48,7 @@ def advance(
     # outputs
     residual: wp.array[float],  # (N, 2, nodes) [px]
     opens: wp.array[int],  # (N, H + 1) see rings.reach
-    states: wp.array[wp.vec4i],  # (N) see carrying.carry_on
+    states: wp.array[wp.vec4i],  # (N) see carrying.carry_on; of holes those that are left
     total: wp.array[float],  # (N, ring, pitch + 40, 4) scratch: sums
     cells: wp.array[float],  # (N, 4 size) the pyramids
     places: wp.array[int],  # (N, 2, pitch) scratch
@@ -59,7 +59,8 @@ def advance(
 ):
     """Each prototype, until the rows before `bottom` are shown.
 
-    Before the first band, its residual flow is found.
+    Before the first band, its residual flow is found. One that needs more rows of sums than there
+    is room for only says so in its state.
     """
     tid = wp.tid()
     if tid >= count:
@@ -200,7 +201,7 @@ def set_aside(
 ):
     """A row of what is wanted; and of all pictures, its pixels that are a hole in one of them.
 
-    Those that there is no room for are counted.
+    Those that there is no room for are only counted, and stay in the band.
     """
     tid = wp.tid()
     if tid >= count:

@@ -46,7 +46,7 @@ float4 mean(__global const float *cells, const int i, const int step)
 
 /* The pixel (x, y) of a level of h x w, interpolated from four cells of the next one.
  *
- * The fourth is 1, or less where a cell is empty and the others are not known yet.
+ * The fourth is 1, or less where one of the four is empty.
  */
 float4 between(__global const float *coarse, const int h, const int w, const int y, const int x)
 {

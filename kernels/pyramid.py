@@ -54,7 +54,7 @@ def mean(cells: wp.array[float], i: int, step: int):
 def between(cells: wp.array[float], coarse: int, h: int, w: int, y: int, x: int):
     """The pixel (x, y) of a level of h x w, interpolated from four cells of the next one.
 
-    The fourth is 1, or less where a cell is empty and the others are not known yet.
+    The fourth is 1, or less where one of the four is empty.
     """
     columns = (w + 1) / 2
     rows = (h + 1) / 2

@@ -4,6 +4,8 @@ import gc
 import os
 import subprocess
 import sys
+import threading
+import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -152,6 +154,23 @@ def test_what_a_backend_imports_is_old(monkeypatch, tmp_path):
         assert gc.get_freeze_count() > frozen / 2
     finally:
         gc.unfreeze()
+
+
+def test_no_part_of_a_launch_outlives_one_that_is_interrupted():
+    """It would write to arrays that are freed by then."""
+    begun, over = threading.Event(), []
+
+    def work(first, _):
+        if first == 0:
+            begun.wait()
+            raise KeyboardInterrupt
+        begun.set()
+        time.sleep(0.3)
+        over.append(first)
+
+    with pytest.raises(KeyboardInterrupt):
+        get_backend("warp", 2).split(2, work)
+    assert over == [1]
 
 
 def test_a_library_that_is_missing_says_what_to_install(monkeypatch):

@@ -83,7 +83,7 @@ class Backend(Protocol):
         """Some of what `hold_prototypes` gave, each moved along C_syn as in CE05, Eq. 2, scaled.
 
         (1, 2, H, P), NumPy (n,), (H, P) -> (n, 3, H, P): planes, see `mmmgpu.backends.planes`.
-        Where the scale is 0 nothing is filled.
+        Where the scale is 0, as in what pads a row, nothing is filled.
         """
 
     def prototype_equations(

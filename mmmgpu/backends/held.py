@@ -33,7 +33,7 @@ class Prototypes:
 
     @property
     def ring(self) -> int:
-        """Rows of sums for any flow."""
+        """Rows of sums for any flow: a power of two, not less than the height."""
         return 1 << (self.height - 1).bit_length()
 
     @property

@@ -86,7 +86,7 @@ def _scratch(k: Launches, held: Prototypes, number: int, ring: int, room: int) -
         "holes": ((height, pitch), np.int32),
         "band": ((COLOURS, depth, pitch), np.float32),
     }
-    pixel: dict[str, Shape] = {
+    pixel: dict[str, Shape] = {  # the kernels see as many values as (number, room, COLOURS)
         "aside": ((number, COLOURS), np.float32),
         "aside_wanted": ((COLOURS,), np.float32),
     }

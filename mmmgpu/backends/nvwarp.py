@@ -181,7 +181,11 @@ class Warp(PrototypeLaunches):
         edges = np.linspace(0, count, min(self.threads, count) + 1).astype(int).tolist()
         own, *others = [(a, b - a) for a, b in itertools.pairwise(edges)]
         started = [_pool(self.threads).submit(work, *span) for span in others]
-        work(*own)  # one thread less to wake, which may come to share a core with another
+        try:
+            work(*own)  # one thread less to wake, which may come to share a core with another
+        finally:
+            for span in started:
+                span.exception()  # all end before the arrays that they write to are freed
         for span in started:
             span.result()
 
