@@ -1,4 +1,4 @@
-/* Weighted sums of images: 16 values of one result or of four a work-item, then what is left over.
+/* Weighted sums of images: 64 values of one result or 16 of four a work-item, then what is left over.
  *
  * Eight terms at a time in float, which leaves at most eight roundings of theirs, and those sums in
  * double, for any number of images. PoCL 3.0 calls its own vload and conversions as functions.
@@ -8,6 +8,7 @@
 
 #define LANES 16
 #define BLOCK 8 /* terms summed in float */
+#define VECTORS 4 /* vectors of one result a work-item: neighbours come from memory together */
 #define TOGETHER 4 /* results for which each image is read once */
 
 /* A vector anywhere in an image. */
@@ -39,29 +40,44 @@ void put(__global float *p, const double4 *total)
 
 __kernel void blend(
     __global const float *restrict images,   /* (M, S) */
-    __global const float *restrict weights,  /* (batch, M) */
+    __global const float *restrict weights,  /* (1, M) */
     const int number,                        /* M */
     const int size,                          /* S */
     const int first,
     const int count,
     /* outputs */
-    __global float *restrict blended)        /* (batch, S), the whole vectors of each row are written */
+    __global float *restrict blended)        /* (1, S), whole vectors are written */
 {
     const int tid = get_global_id(0);
     if (tid >= count)
         return;
-    const int vectors = size / LANES;
-    const int b = (first + tid) / vectors;
-    const int start = (first + tid) % vectors * LANES;
-    double4 total[LANES / 4] = {(double4)(0.0), (double4)(0.0), (double4)(0.0), (double4)(0.0)};
+    const int last = size / LANES - 1;
+    int start[VECTORS]; /* the last vector again, where there are fewer */
+    double4 total[VECTORS][LANES / 4];
+#pragma unroll
+    for (int r = 0; r < VECTORS; ++r) {
+        const int v = (first + tid) * VECTORS + r;
+        start[r] = LANES * (v < last ? v : last);
+        for (int k = 0; k < LANES / 4; ++k)
+            total[r][k] = (double4)(0.0);
+    }
     for (int begin = 0; begin < number; begin += BLOCK) {
         const int end = begin + BLOCK < number ? begin + BLOCK : number;
-        float16 part = (float16)(0.0f);
+        float16 part[VECTORS];
+#pragma unroll
+        for (int r = 0; r < VECTORS; ++r)
+            part[r] = (float16)(0.0f);
         for (int m = begin; m < end; ++m)
-            part += weights[b * number + m] * *(__global const float16u *)(images + m * size + start);
-        add(total, part);
+#pragma unroll
+            for (int r = 0; r < VECTORS; ++r)
+                part[r] += weights[m] * *(__global const float16u *)(images + m * size + start[r]);
+#pragma unroll
+        for (int r = 0; r < VECTORS; ++r)
+            add(total[r], part[r]);
     }
-    put(blended + b * size + start, total);
+#pragma unroll
+    for (int r = 0; r < VECTORS; ++r)
+        put(blended + start[r], total[r]);
 }
 
 __kernel void blend_together(

@@ -1,4 +1,4 @@
-"""Weighted sums of images: 16 values of one result or of four a thread, then what is left over.
+"""Weighted sums of images: 64 values of one result or 16 of four a thread, then what is left over.
 
 Eight terms at a time in float32, which leaves at most eight roundings of theirs, and those sums in
 float64, for any number of images. Warp unrolls a loop with literal bounds: half the time.
@@ -10,6 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 LANES = 16
 BLOCK = 8  # terms summed in float32
+VECTORS = wp.constant(4)  # of one result
 TOGETHER = 4  # results for which each image is read once
 vec16 = wp.types.vector(length=LANES, dtype=wp.float32)
 vec16d = wp.types.vector(length=LANES, dtype=wp.float64)
@@ -18,31 +19,30 @@ vec16d = wp.types.vector(length=LANES, dtype=wp.float64)
 @wp.kernel
 def blend(
     images: wp.array2d[vec16],  # (M, S) as rows of S // 16 whole vectors
-    weights: wp.array[float],  # (batch, M)
+    weights: wp.array[float],  # (1, M)
     number: int,  # M
     size: int,  # S
     first: int,
     count: int,
     # outputs
-    blended: wp.array2d[vec16],  # (batch, S) as rows of S // 16 whole vectors
+    blended: wp.array2d[vec16],  # (1, S) as S // 16 whole vectors
 ):
     tid = wp.tid()
     if tid >= count:
         return
-    vectors = size / LANES
-    b = (first + tid) / vectors
-    v = (first + tid) % vectors
-    total = vec16d()
+    start = VECTORS * (first + tid)
     whole = number - number % BLOCK
-    for begin in range(0, whole, BLOCK):
-        part = vec16()
-        for m in range(BLOCK):
-            part += weights[b * number + begin + m] * images[begin + m, v]
-        total += vec16d(part)
-    rest = vec16()
-    for m in range(whole, number):
-        rest += weights[b * number + m] * images[m, v]
-    blended[b, v] = vec16(total + vec16d(rest))
+    for v in range(start, wp.min(start + VECTORS, size / LANES)):
+        total = vec16d()
+        for begin in range(0, whole, BLOCK):
+            part = vec16()
+            for m in range(BLOCK):
+                part += weights[begin + m] * images[begin + m, v]
+            total += vec16d(part)
+        rest = vec16()
+        for m in range(whole, number):
+            rest += weights[m] * images[m, v]
+        blended[0, v] = vec16(total + vec16d(rest))
 
 
 @wp.kernel

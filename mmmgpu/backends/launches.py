@@ -23,7 +23,7 @@ GPU_WORKERS = 1024  # accumulators in flight on a GPU; on a CPU there is one a t
 GROUP = 4  # channels of one forward warp, as in kernels/forward_warp
 COLOURS = 3  # channels of a picture, as in kernels/sample
 RUN = 16  # points of a thread, as in kernels/sample
-BLENDED = 4  # results of one thread, as in kernels/blend
+VECTORS, BLENDED = 4, 4  # of one result, or results, of a thread of kernels/blend
 TILE = 64  # corpus rows packed at a time
 QUERIES, ROWS = 2, 4  # of one thread of kernels/distance_scan
 PIECE, BLOCK = 1024, 4  # values and rows of one thread of kernels/normal_equations
@@ -117,6 +117,10 @@ class Launches(ABC):
         if count:
             self.split(count, self.launcher(kernel, inputs, outputs))
 
+    def launch_on(self, kernel: str, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """`launch_all`, perhaps without waiting for it: the caller keeps all arrays until then."""
+        self.launch_all(kernel, count, inputs, outputs)
+
     def forward_warp(self, field: Any, flow: Any) -> tuple[Any, Any]:
         fields, height, width, channels = field.shape
         flows = flow.shape[0]
@@ -158,7 +162,7 @@ class Launches(ABC):
         inputs = [images, weights, number, size]
         vectors = size // LANES
         if batch == 1:
-            self.launch_all("blend.blend", vectors, inputs, [blended])
+            self.launch_all("blend.blend", math.ceil(vectors / VECTORS), inputs, [blended])
         else:
             count = math.ceil(batch / BLENDED) * vectors
             self.launch_all("blend.blend_together", count, [*inputs, batch], [blended])
@@ -169,18 +173,25 @@ class Launches(ABC):
         number, size = images.shape[0], math.prod(images.shape[1:])
         pieces = math.ceil(size / PIECE)
         parts = self.empty(pieces, number + 1, number)
-        self.multiply(images, wanted, size, size, 0, parts)
+        self.multiply(images, wanted, size, size, 0, parts, self.launch_all)
         return self.add_up(parts, pieces)
 
     def multiply(
-        self, images: Any, wanted: Any, stride: int, size: int, before: int, parts: Any
+        self,
+        images: Any,
+        wanted: Any,
+        stride: int,
+        size: int,
+        before: int,
+        parts: Any,
+        launch: Callable[[str, int, list[Any], list[Any]], None],
     ) -> int:
         """Products of images of `size` values, after the first `before` parts: the next number."""
         number = parts.shape[2]
         pieces, blocks = math.ceil(size / PIECE), number // BLOCK + 1
         count = pieces * (blocks * (blocks + 1) // 2)
         given = [images, wanted, number, stride, size, before]
-        self.launch_all("normal_equations.multiply", count, given, [parts])
+        launch("normal_equations.multiply", count, given, [parts])
         return before + pieces
 
     def add_up(self, parts: Any, pieces: int) -> Any:

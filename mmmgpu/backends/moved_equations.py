@@ -29,8 +29,12 @@ def moved_equations(
     padded = k.to_device(np.pad(flow.ravel(), LANES))
     given = padded, k.to_device(used.astype(np.int32)), wanted, scale
     ring, room, products = min(RING, held.ring), held.height * held.pitch // ASIDE + 1, None
-    while products is None:
-        products, ring, room = _products(k, held, given, ring, room)
+    try:
+        while products is None:
+            products, ring, room = _products(k, held, given, ring, room)
+    except BaseException:
+        k.wait()  # what is launched uses arrays that would be freed
+        raise
     return products
 
 
@@ -55,20 +59,22 @@ def _products(
         inputs = [flow, *held.arrays, used, scale, height, width, held.pyramid, ring, held.nodes]
         inputs += [held.hole, depth, top, bottom]
         outputs = [s.residual, s.opens, s.states, s.total, s.cells, s.places, s.steps, s.holes]
-        k.launch_all("prototype_equations.advance", number, inputs, [*outputs, flags, s.band])
+        k.launch_on("prototype_equations.advance", number, inputs, [*outputs, flags, s.band])
         inputs = [flags, wanted, number, height, width, depth, room, top, bottom]
         outputs = [s.band, s.band_wanted, s.aside, s.aside_wanted, s.slots, ends]
-        k.launch_all("prototype_equations.set_aside", bottom - top, inputs, outputs)
+        k.launch_on("prototype_equations.set_aside", bottom - top, inputs, outputs)
         stride = COLOURS * depth * pitch
-        pieces = k.multiply(s.band, s.band_wanted, stride, size, pieces, parts)
+        pieces = k.multiply(s.band, s.band_wanted, stride, size, pieces, parts, k.launch_on)
     needed, found = int(k.to_host(s.states)[:number, 0].max()), int(k.to_host(ends)[height])
     if needed > ring or found > room:
         return None, max(needed, ring), max(found + found // ASIDE, room)  # for next frames too
     arrived = k.empty(number, dtype=np.int32)
     inputs = [s.holes, s.slots, scale, s.states, height, width, held.pyramid, room]
-    k.launch_all("prototype_equations.finish", number, inputs, [s.cells, s.aside, arrived])
+    k.launch_on("prototype_equations.finish", number, inputs, [s.cells, s.aside, arrived])
     check_some_valid(k.to_host(arrived))
-    pieces = k.multiply(s.aside, s.aside_wanted, COLOURS * room, COLOURS * found, pieces, parts)
+    pieces = k.multiply(
+        s.aside, s.aside_wanted, COLOURS * room, COLOURS * found, pieces, parts, k.launch_on
+    )
     return k.add_up(parts, pieces), needed, found
 
 

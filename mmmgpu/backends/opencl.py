@@ -219,6 +219,10 @@ class OpenCL(PrototypeLaunches):
 
         return launch
 
+    def launch_on(self, kernel: str, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        if count:
+            self.launch(kernel, 0, count, inputs, outputs)
+
     def split(self, count: int, work: Callable[[int, int], None]) -> None:
         """The driver has the threads."""
         if count:
