@@ -276,22 +276,46 @@ def test_equations_write_to_nothing_that_comes_from_the_host(backend, monkeypatc
     """Drivers may trust that it is only read, and keep a copy of it."""
     images, flows = prototypes("random", (BAND, 40))
     k, scale = get_backend(backend, None), np.ones((BAND, 40), np.float32)
-    to_device, launch_all, brought, written = type(k).to_device, type(k).launch_all, [], []
+    to_device, launcher, brought, written = type(k).to_device, type(k).launcher, [], []
 
     def bringing(self, array):
         brought.append(to_device(self, array))
         return brought[-1]
 
-    def launching(self, kernel, count, inputs, outputs):
+    def launching(self, kernel, inputs, outputs):
         written.extend(outputs)
-        launch_all(self, kernel, count, inputs, outputs)
+        return launcher(self, kernel, inputs, outputs)
 
     monkeypatch.setattr(type(k), "to_device", bringing)
-    monkeypatch.setattr(type(k), "launch_all", launching)
+    monkeypatch.setattr(type(k), "launcher", launching)
     equations(backend, images, flows, flows[1], range(NUMBER), scale, images[0])
     assert brought
     assert written
     assert not {id(a) for a in brought} & {id(a) for a in written}
+
+
+def test_equations_that_are_interrupted_wait_for_what_is_launched(backend, monkeypatch):
+    """It uses arrays that would be freed."""
+    images, flows = prototypes("random", (BAND, 40))
+    k, scale = get_backend(backend, None), np.ones((BAND, 40), np.float32)
+    launch_on, wait, events = type(k).launch_on, type(k).wait, []
+
+    def waiting(self):
+        events.append("wait")
+        wait(self)
+
+    def interrupted(self, kernel, count, inputs, outputs):
+        if kernel == "normal_equations.multiply":
+            raise KeyboardInterrupt
+        events.append(kernel)
+        launch_on(self, kernel, count, inputs, outputs)
+
+    monkeypatch.setattr(type(k), "launch_on", interrupted)
+    monkeypatch.setattr(type(k), "wait", waiting)
+    with pytest.raises(KeyboardInterrupt):
+        equations(backend, images, flows, flows[1], range(NUMBER), scale, images[0])
+    assert events[-1] == "wait"
+    assert "prototype_equations.set_aside" in events
 
 
 def test_equations_seldom_begin_again_where_ever_more_pixels_are_set_aside(backend, monkeypatch):
@@ -299,13 +323,13 @@ def test_equations_seldom_begin_again_where_ever_more_pixels_are_set_aside(backe
     x = np.arange(96) + np.zeros(size)
     images, flows = prototypes("zero", size)
     held, scale = k.hold_prototypes(images, flows, HOLE), k.to_device(np.ones(size, np.float32))
-    image, launch_all, begun = k.to_device(planes(images[0])), type(k).launch_all, []
+    image, launch_on, begun = k.to_device(planes(images[0])), type(k).launch_on, []
 
     def counted(self, kernel, count, inputs, outputs):
         begun.append(kernel == "prototype_equations.advance")
-        launch_all(self, kernel, count, inputs, outputs)
+        launch_on(self, kernel, count, inputs, outputs)
 
-    monkeypatch.setattr(type(k), "launch_all", counted)
+    monkeypatch.setattr(type(k), "launch_on", counted)
     frames = range(14, 40)
     for gap in frames:
         right = np.where(x < 48, -gap, gap)
@@ -358,13 +382,13 @@ def test_equations_begin_again_with_more_room_which_is_kept(backend, monkeypatch
     flow, used = np.stack([right, down], -1).astype(np.float32), np.arange(NUMBER)
     held, scale = k.hold_prototypes(images, flows, HOLE), np.ones(size, np.float32)
     image, how = map(k.to_device, (planes(images[0]), planes(scale[..., None])[0]))
-    launch_all, begun = type(k).launch_all, []
+    launch_on, begun = type(k).launch_on, []
 
     def counted(self, kernel, count, inputs, outputs):
         begun.append(kernel == "prototype_equations.advance")
-        launch_all(self, kernel, count, inputs, outputs)
+        launch_on(self, kernel, count, inputs, outputs)
 
-    monkeypatch.setattr(type(k), "launch_all", counted)
+    monkeypatch.setattr(type(k), "launch_on", counted)
     found, runs = [], []
     for _ in range(2):
         found.append(k.to_host(k.prototype_equations(held, planes(flow), used, image, how)).copy())
