@@ -33,7 +33,7 @@ from math import comb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dpbtrs
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from mmmgpu.errors import InputError
 from mmmgpu.phonemes import PhonemeModels, StandIn, Utterance, segment_durations, sum_by
@@ -267,10 +267,13 @@ def follow(line: Timeline, mean: Array, variance: Array, smoothness: float) -> t
 
 def _factored(line: Timeline, variance: Array, smoothness: float) -> tuple[Array, Array]:
     """D' Sigma^-1 D of one dimension, shape (N,), and the factor of A."""
-    q = line.weight / variance[line.phone]
+    q = line.weight * (1 / variance)[line.phone]
     A = smoothness * line.band
     A[:, 0] += q
-    return q, cholesky_banded(A.T, lower=True, overwrite_ab=True, check_finite=False)
+    factor, failed = dpbtrf(A.T, lower=1, overwrite_ab=1)
+    if failed:
+        raise np.linalg.LinAlgError(f"A is not positive definite at frame {failed - 1}")
+    return q, factor
 
 
 def _solve(factor: Array, b: Array) -> Array:
@@ -304,9 +307,9 @@ def error_and_gradient(
     mu = mean[line.phone]
     y = _solve(factor, q * mu)
     residual = y - z
-    pull = q * _solve(factor, 2 * residual)  # D^2 P g
-    by_mean = _sum_by_phone(line, pull, len(mean))
-    by_log_variance = _sum_by_phone(line, pull * (y - mu), len(mean))
+    pull = q * _solve(factor, residual)  # D^2 P g / 2
+    by_mean = 2 * _sum_by_phone(line, pull, len(mean))
+    by_log_variance = 2 * _sum_by_phone(line, pull * (y - mu), len(mean))
     return float(residual @ residual), by_mean, by_log_variance
 
 

@@ -147,6 +147,13 @@ def test_gradient_is_the_slope_of_the_dense_error():
         np.testing.assert_allclose(by_log_variance[p], slope, rtol=1e-6, atol=1e-7)
 
 
+def test_a_system_without_a_solution_is_an_error():
+    models = random_models(np.random.default_rng(2))
+    line = lay_out_utterances(models, [Utterance(np.zeros((8, 3)), list("aabbccdd"))], order=2)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite at frame 0"):
+        error_and_gradient(line, np.zeros(8), models.mean[:, 0], -models.variance[:, 0], 1e-9)
+
+
 def test_utterances_of_one_timeline_do_not_touch():
     clips = make_corpus(np.random.default_rng(5))
     models = pool(clips)
