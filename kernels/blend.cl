@@ -6,13 +6,11 @@
 
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
-#define LANES 16
+#include "lanes.cl"
+
 #define BLOCK 8 /* terms summed in float */
 #define VECTORS 4 /* vectors of one result a work-item: neighbours come from memory together */
 #define TOGETHER 4 /* results for which each image is read once */
-
-/* A vector anywhere in an image. */
-typedef float float16u __attribute__((ext_vector_type(16), aligned(4)));
 
 double4 wide(const float4 x)
 {
@@ -32,10 +30,9 @@ void add(double4 *total, const float16 part)
     total[3] += wide(part.scdef);
 }
 
-void put(__global float *p, const double4 *total)
+void put_total(__global float *p, const double4 *total)
 {
-    *(__global float16u *)p = (float16)(
-        narrow(total[0]), narrow(total[1]), narrow(total[2]), narrow(total[3]));
+    put(p, (float16)(narrow(total[0]), narrow(total[1]), narrow(total[2]), narrow(total[3])));
 }
 
 __kernel void blend(
@@ -70,14 +67,14 @@ __kernel void blend(
         for (int m = begin; m < end; ++m)
 #pragma unroll
             for (int r = 0; r < VECTORS; ++r)
-                part[r] += weights[m] * *(__global const float16u *)(images + m * size + start[r]);
+                part[r] += weights[m] * get(images + m * size + start[r]);
 #pragma unroll
         for (int r = 0; r < VECTORS; ++r)
             add(total[r], part[r]);
     }
 #pragma unroll
     for (int r = 0; r < VECTORS; ++r)
-        put(blended + start[r], total[r]);
+        put_total(blended + start[r], total[r]);
 }
 
 __kernel void blend_together(
@@ -112,7 +109,7 @@ __kernel void blend_together(
         for (int r = 0; r < TOGETHER; ++r)
             part[r] = (float16)(0.0f);
         for (int m = begin; m < end; ++m) {
-            const float16 values = *(__global const float16u *)(images + m * size + start);
+            const float16 values = get(images + m * size + start);
 #pragma unroll
             for (int r = 0; r < TOGETHER; ++r)
                 part[r] += weights[b[r] * number + m] * values;
@@ -123,7 +120,7 @@ __kernel void blend_together(
     }
 #pragma unroll
     for (int r = 0; r < TOGETHER; ++r)
-        put(blended + b[r] * size + start, total[r]);
+        put_total(blended + b[r] * size + start, total[r]);
 }
 
 __kernel void blend_rest(

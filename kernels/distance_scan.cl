@@ -8,11 +8,8 @@
 
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
-#ifndef __has_builtin
-#define __has_builtin(name) 0
-#endif
+#include "lanes.cl"
 
-#define LANES 16
 #define MAGIC 0x5f200000
 #define TINY 1.2e-38f /* added to squares, so that they have a 1/sqrt */
 #define BLOCK 64 /* vectors summed in float */
@@ -117,7 +114,7 @@ float16 add_root(const float16 part, const float16 w, const float16 x)
 
 #endif
 
-double sum(const float8 part)
+double sum_of(const float8 part)
 {
     const float4 a = part.lo + part.hi;
     return ((double)a.s0 + (double)a.s1) + ((double)a.s2 + (double)a.s3);
@@ -172,7 +169,7 @@ __kernel void distance_scan(
         }
 #pragma unroll
         for (int j = 0; j <= PAIRS; ++j)
-            total[j] += sum(part[j].lo + part[j].hi);
+            total[j] += sum_of(part[j].lo + part[j].hi);
     }
 #pragma unroll
     for (int j = 0; j < PAIRS; ++j)

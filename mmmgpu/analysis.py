@@ -234,8 +234,9 @@ def _fit_all(analyzer: Analyzer, wanted: F32, flow: F32) -> Floats:
     """beta (M,) of all prototypes, where the mask is; `wanted` as planes."""
     k, scale = analyzer.kernels, analyzer.masked
     every, image = np.arange(len(analyzer.thumbnails)), k.to_device(wanted * scale.plane)
-    found = k.prototype_equations(analyzer.held, planes(flow), every, image, scale.held)
-    products = k.to_host(found)
+    products = k.to_host(
+        k.prototype_equations(analyzer.held, planes(flow), every, image, scale.held)
+    )
     return solve_simplex(products[:-1], products[-1])
 
 

@@ -318,18 +318,24 @@ def test_equations_that_are_interrupted_wait_for_what_is_launched(backend, monke
     assert "prototype_equations.set_aside" in events
 
 
-def test_equations_seldom_begin_again_where_ever_more_pixels_are_set_aside(backend, monkeypatch):
-    k, size = replace(get_backend(backend)), (BAND, 96)
-    x = np.arange(96) + np.zeros(size)
-    images, flows = prototypes("zero", size)
-    held, scale = k.hold_prototypes(images, flows, HOLE), k.to_device(np.ones(size, np.float32))
-    image, launch_on, begun = k.to_device(planes(images[0])), type(k).launch_on, []
+def runs_of(k, monkeypatch):
+    """For each launch from now on, whether it begins equations of one band."""
+    launch_on, begun = type(k).launch_on, []
 
     def counted(self, kernel, count, inputs, outputs):
         begun.append(kernel == "prototype_equations.advance")
         launch_on(self, kernel, count, inputs, outputs)
 
     monkeypatch.setattr(type(k), "launch_on", counted)
+    return begun
+
+
+def test_equations_seldom_begin_again_where_ever_more_pixels_are_set_aside(backend, monkeypatch):
+    k, size = replace(get_backend(backend)), (BAND, 96)
+    x = np.arange(96) + np.zeros(size)
+    images, flows = prototypes("zero", size)
+    held, scale = k.hold_prototypes(images, flows, HOLE), k.to_device(np.ones(size, np.float32))
+    image, begun = k.to_device(planes(images[0])), runs_of(k, monkeypatch)
     frames = range(14, 40)
     for gap in frames:
         right = np.where(x < 48, -gap, gap)
@@ -382,14 +388,7 @@ def test_equations_begin_again_with_more_room_which_is_kept(backend, monkeypatch
     flow, used = np.stack([right, down], -1).astype(np.float32), np.arange(NUMBER)
     held, scale = k.hold_prototypes(images, flows, HOLE), np.ones(size, np.float32)
     image, how = map(k.to_device, (planes(images[0]), planes(scale[..., None])[0]))
-    launch_on, begun = type(k).launch_on, []
-
-    def counted(self, kernel, count, inputs, outputs):
-        begun.append(kernel == "prototype_equations.advance")
-        launch_on(self, kernel, count, inputs, outputs)
-
-    monkeypatch.setattr(type(k), "launch_on", counted)
-    found, runs = [], []
+    begun, found, runs = runs_of(k, monkeypatch), [], []
     for _ in range(2):
         found.append(k.to_host(k.prototype_equations(held, planes(flow), used, image, how)).copy())
         runs.append(sum(begun))

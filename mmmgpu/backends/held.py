@@ -5,7 +5,6 @@ from typing import Any
 
 from mmmgpu.backends.planes import pitch_of
 
-COLOURS = 3  # channels of a picture
 MARGIN = 40  # pixels of a row of sums beside the picture, as in kernels/rings
 
 

@@ -118,7 +118,7 @@ class Launches(ABC):
             self.split(count, self.launcher(kernel, inputs, outputs))
 
     def launch_on(self, kernel: str, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """`launch_all`, perhaps without waiting for it: the caller keeps all arrays until then."""
+        """`launch_all`; a driver may be at it still: the caller keeps all arrays until it waits."""
         self.launch_all(kernel, count, inputs, outputs)
 
     def forward_warp(self, field: Any, flow: Any) -> tuple[Any, Any]:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, check_some_valid
-from mmmgpu.backends.held import COLOURS, MARGIN, Prototypes
-from mmmgpu.backends.launches import PIECE, Launches
+from mmmgpu.backends.held import MARGIN, Prototypes
+from mmmgpu.backends.launches import COLOURS, PIECE, Launches
 from mmmgpu.backends.planes import LANES
 
 BAND = 48  # rows of all moved prototypes at a time

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mmmgpu.arrays import F32, check_some_valid
-from mmmgpu.backends.held import COLOURS, MARGIN, Prototypes
-from mmmgpu.backends.launches import GPU_WORKERS, Launches
+from mmmgpu.backends.held import MARGIN, Prototypes
+from mmmgpu.backends.launches import COLOURS, GPU_WORKERS, Launches
 from mmmgpu.backends.moved_equations import moved_equations
 from mmmgpu.backends.orientation import orient
 from mmmgpu.backends.planes import LANES, pitch_of
